@@ -1,6 +1,7 @@
 """The independent world: recordings with known hidden physics, simulated without the models."""
 
-from jaxvm.simulate.effects import HIDEABLE, HiddenEffect, Truth
+from jaxvm.simulate.effects import HIDEABLE
+from jaxvm.simulate.hidden import HiddenEffect, Truth
 from jaxvm.simulate.world import simulate_deformation_scene
 from jaxvm.simulate.write import SimulatedRecording
 

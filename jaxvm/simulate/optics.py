@@ -80,7 +80,7 @@ def distances(site: Site, rangefinder: Rangefinder, plate: Plate) -> Times:
     beam = site.station.rotation.apply(rangefinder.place.rotation.apply([0.0, 0.0, 1.0]))
     placed: Placement = plate.place(t)
     foot = placed.inward(np.broadcast_to(origin, (t.size, 3)))
-    ray = placed.rotation.inv().apply(beam)
+    ray = np.broadcast_to(placed.rotation.inv().apply(beam), (t.size, 3))
     length = -foot[:, 2] / ray[:, 2]
     for _ in range(6):  # the face may be bent: its height where the beam meets it
         hit = foot + length[:, None] * ray

@@ -54,8 +54,8 @@ class PlatePlan:
 
 
 PLATES: dict[str, PlatePlan] = {
-    "reference_near": PlatePlan((-0.75, 0.50, 5.0), 1.3, (7.0, 27.0, -2.0)),
-    "deck": PlatePlan((1.30, -0.10, 8.0), 1.8, (-28.0, 8.0, 3.0)),
+    "reference_near": PlatePlan((-0.98, 0.64, 5.0), 1.6, (7.0, 27.0, -2.0)),
+    "deck": PlatePlan((1.42, -0.12, 8.0), 1.8, (-28.0, 8.0, 3.0)),
     "reference_far": PlatePlan((-2.20, -2.10, 12.0), 1.8, (18.0, -23.0, 4.0)),
 }
 
@@ -89,7 +89,7 @@ def deck_motion(
     slow_period = np.array([1.1, 2.3, 5.2]) * 3600.0 * rng.uniform(0.9, 1.1, 3)
     sway_period = np.array([5.1, 7.3, 9.7]) * rng.uniform(0.95, 1.05, 3)
     slow = np.array([0.004, 0.003, 0.008, 0.0004, 0.0003, 0.0003])
-    sway = np.array([0.042, 0.022, 0.030, 0.0030, 0.0030, 0.0040])
+    sway = np.array([0.055, 0.025, 0.036, 0.0030, 0.0030, 0.0040])
     amplitude = np.concatenate(
         [slow * rng.uniform(0.5, 1.2, (3, 6)), sway * rng.uniform(0.6, 1.1, (3, 6))]
     )
@@ -121,17 +121,18 @@ def build_site(seed: int, size: Size) -> Site:
     for name, plan in PLATES.items():
         plates[name] = _plate(scene, name, plan, extent.side, station)
 
+    switched_on = np.round(scene.uniform(-60.0, -10.0, 2), 1)
     bodies = {
-        "left": CameraBody(scene.uniform(1.1, 1.4), scene.uniform(-60.0, -10.0), 0.0022),
+        "left": CameraBody(scene.uniform(1.1, 1.4), switched_on[0], sunlit_m2=0.0010),
         "right": CameraBody(
             scene.uniform(0.9, 1.2),
-            scene.uniform(-60.0, -10.0),
-            0.0,
+            switched_on[1],
+            sunlit_m2=0.0,
             housing_j_per_k=140.0,
             to_air_w_per_k=0.10,
         ),
     }
-    stands = {"left": (-0.6, 3.0, 1.6), "right": (0.6, -3.0, -2.1)}  # x (m), yaw, roll (degrees)
+    stands = {"left": (-0.6, 5.0, 1.6), "right": (0.6, -5.0, -2.1)}  # x (m), yaw, roll (degrees)
     cameras = {
         name: _camera(
             scene, name, *stands[name], body, body.housing(weather.ambient, weather.irradiance)
@@ -192,7 +193,7 @@ def _camera(
         IMAGE_SIZE,
         distortion,
         rest,
-        powered_on_s=round(body.powered_on_s, 1),
+        powered_on_s=float(body.powered_on_s),
         housing=housing,
         focal=lambda t: np.broadcast_to(focal, (t.size, 2)),
         centre=lambda t: np.broadcast_to(centre, (t.size, 2)),

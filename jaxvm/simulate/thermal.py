@@ -49,9 +49,9 @@ class Signal:
             follower[i] = at
         return Signal(self.t, follower)
 
-    def about_mean(self, t: Float[np.ndarray, " m"]) -> "Signal":
-        """This signal minus its mean over the given times: its excess over usual conditions."""
-        return Signal(self.t, self.value - self(t).mean())
+    def above(self, level: float) -> "Signal":
+        """How much this signal exceeds a fixed level."""
+        return Signal(self.t, self.value - level)
 
     def span(self, t: Float[np.ndarray, " m"]) -> float:
         """Largest minus smallest value over the given times."""
@@ -116,9 +116,10 @@ def make_weather(rng: np.random.Generator, start_s: float, end_s: float) -> Weat
     sun = np.clip(np.sin(np.pi * (hours + 3.5) / 14.0), 0.0, None)
     irradiance = 620.0 * sun * np.exp(-1.3 * clouds)
 
-    ambient = 19.0 + 3.0 * np.sin(2 * np.pi * (hours - rng.uniform(0.5, 1.5)) / 24.0)
-    for middle in rng.uniform(-1.0, 8.5, 5):
-        ambient += rng.uniform(-2.6, 2.6) * _bump(hours, middle, rng.uniform(0.4, 0.9))
+    ambient = 19.0 + 3.0 * np.sin(2 * np.pi * (hours - rng.uniform(1.0, 2.0)) / 24.0)
+    middles = np.arange(0.4, 8.4, 1.6) + rng.uniform(-0.4, 0.4, 5)
+    for middle, sign in zip(middles, (1, -1, 1, -1, 1), strict=True):
+        ambient += sign * rng.uniform(3.0, 5.0) * _bump(hours, middle, rng.uniform(0.4, 0.75))
     ambient += 0.45 * np.tanh(2.5 * np.sin(2 * np.pi * hours / rng.uniform(0.55, 0.68)))
     ambient += _visits(rng, hours, count=7, size=(-3.0, -1.2), decay_h=0.16)
     ambient += _wander(rng, t, sd=0.12, tau=700.0)
@@ -126,9 +127,9 @@ def make_weather(rng: np.random.Generator, start_s: float, end_s: float) -> Weat
     humidity = 48.0 - 1.6 * (ambient - 19.0) + _wander(rng, t, sd=1.2, tau=1800.0)
     humidity += _visits(rng, hours, count=5, size=(6.0, 15.0), decay_h=0.55)
 
-    gradient = 1.2 + 2.2 * Signal(t, irradiance).lagged(900.0).value / 400.0
+    gradient = 0.4 + 2.2 * Signal(t, irradiance).lagged(900.0).value / 400.0
     for middle in rng.uniform(-0.5, 8.5, 6):
-        gradient += rng.uniform(-2.0, 2.0) * _bump(hours, middle, rng.uniform(0.2, 0.5))
+        gradient += rng.uniform(-2.5, 2.5) * _bump(hours, middle, rng.uniform(0.25, 0.6))
     gradient += _wander(rng, t, sd=0.25, tau=900.0)
 
     # Doors and fans do not act at once: the air itself needs two minutes.

@@ -10,7 +10,8 @@ from dataclasses import replace
 import numpy as np
 
 from jaxvm.simulate.bodies import Site
-from jaxvm.simulate.effects import HIDEABLE, Truth
+from jaxvm.simulate.effects import HIDEABLE
+from jaxvm.simulate.hidden import Truth
 from jaxvm.simulate.optics import distances, photograph
 from jaxvm.simulate.scene import EXTENTS, Size, build_site
 from jaxvm.simulate.write import Photographs, SimulatedRecording, engineers_model, tables

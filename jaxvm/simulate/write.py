@@ -10,11 +10,14 @@ import tomli_w
 from jaxtyping import Float
 
 from jaxvm.simulate.bodies import Site
-from jaxvm.simulate.effects import Truth
+from jaxvm.simulate.hidden import Truth
 from jaxvm.simulate.scene import BEFORE_S, velocity
 
 PIXEL_NOISE_PX = 0.05
 RANGE_NOISE_M = 0.0002
+RATE_NOISE = np.array([2e-4, 2e-4, 2e-4, 2e-5, 2e-5, 2e-5])
+"""Standard deviation of a recorded velocity (m/s) and angular rate (rad/s)."""
+
 LOG_EVERY_S = 60.0
 
 CHANNELS: dict[str, tuple[str, float, int]] = {
@@ -65,7 +68,7 @@ def tables(
     """The four tables as instruments deliver them: noisy, rounded, some marks missed."""
     return {
         "observations": _observations(site, photographs, rng),
-        "epochs": _epochs(site),
+        "epochs": _epochs(site, rng),
         "drivers": _drivers(site, rng),
         "ranges": pd.DataFrame(
             {
@@ -107,13 +110,14 @@ def _observations(site: Site, photographs: Photographs, rng: np.random.Generator
     return pd.concat(parts).sort_values("epoch", kind="stable", ignore_index=True)
 
 
-def _epochs(site: Site) -> pd.DataFrame:
+def _epochs(site: Site, rng: np.random.Generator) -> pd.DataFrame:
     columns = {"epoch": np.arange(site.epoch_t.size), "t": site.epoch_t}
     for plate in site.plates.values():
         if plate.moves:
             rates = velocity(plate, site.epoch_t)
+            rates = rates + rng.normal(0.0, RATE_NOISE, rates.shape)
             for j, name in enumerate(("vx", "vy", "vz", "wx", "wy", "wz")):
-                columns[f"{plate.name}.{name}"] = np.round(rates[:, j], 5)
+                columns[f"{plate.name}.{name}"] = np.round(rates[:, j], 5) + 0.0
     return pd.DataFrame(columns)
 
 
