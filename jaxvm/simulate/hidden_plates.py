@@ -78,7 +78,8 @@ def mark_displaced(site: Site, rng: np.random.Generator, strength: float) -> Tru
     name, at = plate.mark_names[which], plate.nominal[which]
 
     def restuck(t: Times, nominal: Points) -> Points:
-        return np.isclose(nominal, at).all(axis=1)[:, None] * offset
+        here = np.isclose(nominal, at).all(axis=1, keepdims=True)
+        return here * offset
 
     plate.shape = plus(plate.shape, restuck)
     return Truth(

@@ -165,4 +165,5 @@ def _wander(
 ) -> Float[np.ndarray, " n"]:
     """Ornstein-Uhlenbeck noise: standard deviation sd, correlation time tau (s)."""
     a = np.exp(-(t[1] - t[0]) / tau)
-    return lfilter([sd * np.sqrt(1.0 - a * a)], [1.0, -a], rng.standard_normal(t.size))
+    kicks = sd * np.sqrt(1.0 - a * a) * rng.standard_normal(t.size)
+    return np.asarray(lfilter([1.0], [1.0, -a], kicks))
