@@ -1,0 +1,220 @@
+"""Factors: one local prediction and a table of the observations that it explains.
+
+A factor knows, for each of its observations, which positions of the flat state it touches (its
+*slots*), what was measured, and how to predict it. The residual of the network is all factors, one
+after the other; the block Jacobian comes from the same local functions (`jaxvm.network.residual`).
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxvm.geometry.lenses import LensFamily
+from jaxvm.geometry.poses import Pose, pose_from_vector, se3_log
+from jaxvm.physics.chain import Aim, Circumstances, Sight, predict_pixel, predict_range
+from jaxvm.physics.ports import PortValues
+
+
+def rounded(n: int) -> int:
+    """The next number of the form m * 2^k with m in 8..16: at most an eighth more."""
+    step = 1 << max(int(n - 1).bit_length() - 4, 0)
+    return -(-n // step) * step
+
+
+class Course(NamedTuple):
+    """What one observation needs of the effects: their patterns and their courses at its epoch.
+
+    The courses may be linearised about `constant`: then `slope` carries their derivative, and the
+    local function depends on the nonlinear constants in its own row alone.
+    """
+
+    pattern: Float[Array, " columns"]
+    value: Float[Array, " columns"]
+    slope: Float[Array, "columns constants"] | None
+    constant: Float[Array, " constants"]
+
+
+class Row(NamedTuple):
+    """The values at an observation's slots, split into its own parameters and the effects'."""
+
+    own: Float[Array, " slots"]
+    amplitude: Float[Array, " columns"]
+    constant: Float[Array, " constants"]
+
+
+def port_values(
+    row: Row, course: Course, ports: Float[Array, "columns ports"]
+) -> Float[Array, " ports"]:
+    """Port values of one observation: what all effects together do to it."""
+    value = course.value
+    if course.slope is not None:
+        value = value + course.slope @ (row.constant - course.constant)
+    return (row.amplitude * value * course.pattern) @ ports
+
+
+class Factor(eqx.Module):
+    """A table of observations with one local prediction.
+
+    Attributes:
+        slots: positions in the flat state of each observation's own parameters.
+        sigma: standard deviation of each residual component, in its unit.
+        weight: 1 where used, 0 where set aside or rejected.
+    """
+
+    slots: eqx.AbstractVar[Int[Array, "observations slots"]]
+    sigma: eqx.AbstractVar[Float[Array, "observations components"]]
+    weight: eqx.AbstractVar[Float[Array, " observations"]]
+
+    @property
+    def n_real(self) -> int:
+        """Number of observations without the padding at the end of the table."""
+        return self.slots.shape[0]
+
+    def data(self):
+        """PyTree of the recorded values; its leaves lead with the observations."""
+        raise NotImplementedError
+
+    def local(self, own, data, ports: PortValues) -> Float[Array, " components"]:
+        """Predicted minus measured of one observation, in its unit."""
+        raise NotImplementedError
+
+
+class PixelFactor(Factor):
+    """Image points of all cameras with one family of lenses: predicted minus measured pixel.
+
+    The table is padded to a round number of rows, so that recordings of similar size are the same
+    program; padding repeats the last observation with weight zero.
+    """
+
+    family: LensFamily = eqx.field(static=True)
+    real: Int[Array, ""]
+    slots: Int[Array, "observations slots"]
+    sigma: Float[Array, "observations 2"]
+    weight: Float[Array, " observations"]
+    circumstances: Circumstances
+    epoch: Int[Array, " observations"]
+    pattern: Float[Array, "observations columns"]
+
+    @property
+    def n_real(self) -> int:
+        return int(self.real)
+
+    def data(self):
+        return self.circumstances
+
+    def sight(self, own: Float[Array, " slots"]) -> Sight:
+        """Parameters of one observation from the values at its slots."""
+        n = self.family.n_coefficients
+        return Sight(
+            focal=own[0:2],
+            centre=own[2:4],
+            station_from_camera=own[4:10],
+            world_from_station=own[10:16],
+            world_from_target=own[16:22],
+            point=own[22:25],
+            distortion=own[25 : 25 + n],
+        )
+
+    def local(self, own, data, ports):
+        return predict_pixel(self.family, self.sight(own), data, ports) - data.pixel
+
+
+class RangeFactor(Factor):
+    """Distances of all rangefinders: predicted minus measured (m)."""
+
+    slots: Int[Array, "observations slots"]
+    sigma: Float[Array, "observations 1"]
+    weight: Float[Array, " observations"]
+    circumstances: Circumstances
+    to_plane: Float[Array, " observations"]
+    measured: Float[Array, " observations"]
+    epoch: Int[Array, " observations"]
+    pattern: Float[Array, "observations columns"]
+
+    def data(self):
+        return self.circumstances, self.to_plane, self.measured
+
+    def local(self, own, data, ports):
+        circumstances, to_plane, measured = data
+        aim = Aim(own[0:6], own[6:12], own[12:18], own[18:21])
+        return (predict_range(aim, circumstances, to_plane, ports) - measured)[None]
+
+
+class LinkFactor(Factor):
+    """Measured or calibrated relative poses: log(measured^-1 . from^-1 . to), turn then shift.
+
+    A node is a body on a carrier (a camera on its station); one that is its own carrier has the
+    identity as its second pose.
+    """
+
+    slots: Int[Array, "observations 24"]
+    sigma: Float[Array, "observations 6"]
+    weight: Float[Array, " observations"]
+    measured: Float[Array, "observations 6"]
+
+    def data(self):
+        return self.measured
+
+    def local(self, own, data, ports):
+        poses = [pose_from_vector(own[6 * k : 6 * k + 6]) for k in range(4)]
+        world_from_a, world_from_b = poses[0] @ poses[1], poses[2] @ poses[3]
+        return se3_log(pose_from_vector(data).inverse() @ world_from_a.inverse() @ world_from_b)
+
+
+class EdgeFactor(Factor):
+    """Measured relative poses that are unknowns themselves: log(measured^-1 . link)."""
+
+    slots: Int[Array, "observations 6"]
+    sigma: Float[Array, "observations 6"]
+    weight: Float[Array, " observations"]
+    measured: Float[Array, "observations 6"]
+
+    def data(self):
+        return self.measured
+
+    def local(self, own, data, ports):
+        return se3_log(pose_from_vector(data).inverse() @ pose_from_vector(own))
+
+
+class ClosureFactor(Factor):
+    """Loops of relative poses whose product must be the identity: log(T1^s1 . T2^s2 ...).
+
+    Shorter loops are filled up with identities.
+    """
+
+    slots: Int[Array, "observations slots"]
+    sigma: Float[Array, "observations 6"]
+    weight: Float[Array, " observations"]
+    forward: Float[Array, "observations links"]
+
+    def data(self):
+        return self.forward
+
+    def local(self, own, data, ports):
+        product = Pose.identity()
+        for k in range(self.slots.shape[1] // 6):
+            link = pose_from_vector(own[6 * k : 6 * k + 6])
+            back = link.inverse()
+            ahead = data[k] > 0.0
+            product = product @ Pose(
+                jnp.where(ahead, link.rotation, back.rotation),
+                jnp.where(ahead, link.shift, back.shift),
+            )
+        return se3_log(product)
+
+
+class PriorFactor(Factor):
+    """What is known about single parameters beforehand: value minus expected value."""
+
+    slots: Int[Array, "observations 1"]
+    sigma: Float[Array, "observations 1"]
+    weight: Float[Array, " observations"]
+    expected: Float[Array, " observations"]
+
+    def data(self):
+        return self.expected
+
+    def local(self, own, data, ports):
+        return own - data

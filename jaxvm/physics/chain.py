@@ -1,0 +1,280 @@
+"""The model chain: one pure function for each stage, and their composition for one observation.
+
+    target -> structure -> shutter -> medium -> mount -> lens -> sensor -> detection
+
+Each stage takes the ports that act on it (`jaxvm.physics.ports`); with all ports at zero the chain
+is the plain model. Only one observation is written here: tables of observations are `vmap`ped.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxvm.geometry.lenses import LensFamily
+from jaxvm.geometry.poses import Pose, pose_from_vector
+from jaxvm.geometry.rotations import so3_exp
+from jaxvm.physics.ports import PortValues
+
+WINDOW_INDEX = 1.52
+"""Refractive index of the glass that `medium.window` puts before the lens (N-BK7, visible)."""
+
+
+class Sight(NamedTuple):
+    """The unknowns that one observation touches, gathered from the state."""
+
+    focal: Float[Array, "2"]
+    centre: Float[Array, "2"]
+    distortion: Float[Array, " coefficients"]
+    station_from_camera: Float[Array, "6"]
+    world_from_station: Float[Array, "6"]
+    world_from_target: Float[Array, "6"]
+    point: Float[Array, "3"]
+
+
+class Circumstances(NamedTuple):
+    """What is recorded about one observation and is not estimated."""
+
+    pixel: Float[Array, "2"]  # measured (or nominal) image point, px
+    image_height: Float[Array, ""]  # px
+    target_centre: Float[Array, "3"]  # target coordinates, m
+    target_half_size: Float[Array, "2"]  # target coordinates, m
+    velocity: Float[Array, "6"]  # of the target's origin in the world: m/s and rad/s
+
+
+# --- target -------------------------------------------------------------------------------------
+
+
+def mark(
+    point: Float[Array, "3"],
+    centre: Float[Array, "3"],
+    half_size: Float[Array, "2"],
+    ports: PortValues,
+) -> Float[Array, "3"]:
+    """Mark in target coordinates (m) on a target that has grown, bent or been misprinted.
+
+    Bow and twist have mrcal's shape: `bow_x` is the deflection of the middle against the edges,
+    4c(1-c) over the width c in [0, 1], which is 1-xi^2 over xi in [-1, 1]; twist is xi*eta.
+    Growth acts about the centre of the target, the part of a plate that its pose describes.
+    """
+    if ports.plain:
+        return point
+    arm = point - centre
+    xi, eta = arm[:2] / half_size
+    growth = 1.0 + jnp.stack(
+        [
+            ports["target.scale"] + ports["target.scale_x"],
+            ports["target.scale"] + ports["target.scale_y"],
+            jnp.asarray(ports["target.scale"]),
+        ]
+    )
+    lift = (
+        ports["target.bow_x"] * (1.0 - xi**2)
+        + ports["target.bow_y"] * (1.0 - eta**2)
+        + ports["target.twist"] * xi * eta
+    )
+    grown = centre + growth * arm + jnp.zeros(3).at[2].set(lift)
+    return grown + ports.axes("target.point")
+
+
+# --- structure and shutter ----------------------------------------------------------------------
+
+
+def place(
+    world_from_target: Pose,
+    mark_target: Float[Array, "3"],
+    delay: Float[Array, ""] | float,
+    velocity: Float[Array, "6"],
+    ports: PortValues,
+) -> Float[Array, "3"]:
+    """Mark in the world (m) at the moment of exposure, `delay` seconds after the recorded time.
+
+    The target turns about its own origin and about axes parallel to the world's.
+    """
+    arm = world_from_target.rotation @ mark_target
+    if ports.plain:
+        return arm + world_from_target.shift
+    turn = ports.axes("structure.turn") + delay * velocity[3:]
+    shift = ports.axes("structure.shift") + delay * velocity[:3]
+    return so3_exp(turn) @ arm + world_from_target.shift + shift
+
+
+def exposure_delay(
+    pixel: Float[Array, "2"], image_height: Float[Array, ""], ports: PortValues
+) -> Float[Array, ""] | float:
+    """Seconds between the recorded time and the exposure of the row that holds the mark.
+
+    `shutter.row_time` counts from the middle row, so it does not act as a clock offset.
+    """
+    if ports.plain:
+        return 0.0
+    row = (pixel[1] + 0.5) / image_height - 0.5
+    return ports["clock.offset"] + ports["shutter.row_time"] * row
+
+
+# --- mount --------------------------------------------------------------------------------------
+
+
+def look(
+    world_from_station: Pose,
+    station_from_camera: Pose,
+    mark_world: Float[Array, "3"],
+    ports: PortValues,
+) -> Float[Array, "3"]:
+    """Mark in camera coordinates (m). Station and camera turn and move about their own axes."""
+    seen_by_station = _disturb(world_from_station.inverse().apply(mark_world), "station", ports)
+    return _disturb(station_from_camera.inverse().apply(seen_by_station), "mount", ports)
+
+
+def _disturb(point: Float[Array, "3"], body: str, ports: PortValues) -> Float[Array, "3"]:
+    if ports.plain:
+        return point
+    # The body turns by +omega and moves by +s in its own axes, so what it sees does the opposite.
+    return so3_exp(-ports.axes(f"{body}.turn")) @ (point - ports.axes(f"{body}.shift"))
+
+
+# --- medium -------------------------------------------------------------------------------------
+
+
+def refract(mark_cam: Float[Array, "3"], ports: PortValues) -> Float[Array, "3"]:
+    """Apparent mark in camera coordinates (m) through bending air and a plane window.
+
+    Air with a constant gradient of its index bends rays to arcs of curvature k (rad per m of
+    path): the mark seems displaced by k L^2 / 2 across the line of sight (MATHEMATICS 1.9). A
+    plane-parallel plate of thickness d and index n, normal to the axis, brings the mark nearer by
+    d (1 - cos i / sqrt(n^2 - sin^2 i)) along the axis and turns no ray.
+    """
+    if ports.plain:
+        return mark_cam
+    square = mark_cam @ mark_cam
+    bend = 0.5 * square * jnp.stack([ports["medium.bend_u"], ports["medium.bend_v"]])
+    bent = mark_cam + jnp.concatenate([bend, jnp.zeros(1)])
+    cos2 = bent[2] ** 2 / (bent @ bent)
+    nearer = ports["medium.window"] * (1.0 - jnp.sqrt(cos2 / (WINDOW_INDEX**2 - (1.0 - cos2))))
+    return bent.at[2].add(-nearer)
+
+
+# --- lens, sensor, detection --------------------------------------------------------------------
+
+
+def image(
+    family: LensFamily,
+    distortion: Float[Array, " coefficients"],
+    mark_cam: Float[Array, "3"],
+    ports: PortValues,
+) -> Float[Array, "2"]:
+    """Ideal image point (principal distance 1) of a mark in camera coordinates (m).
+
+    `lens.entrance` moves the entrance pupil along the axis by entrance * theta^2, theta being the
+    field angle: rays then do not meet in one point (a non-central lens).
+    """
+    if ports.plain:
+        return family.distort(distortion, mark_cam)
+    theta = jnp.arctan2(_safe_norm(mark_cam[:2]), mark_cam[2])
+    from_pupil = mark_cam.at[2].add(-ports["lens.entrance"] * theta**2)
+    extra = jnp.stack(
+        [
+            ports["lens.k1"],
+            ports["lens.k2"],
+            ports["lens.k3"],
+            ports["lens.p1"],
+            ports["lens.p2"],
+            ports["lens.tilt_x"],
+            ports["lens.tilt_y"],
+        ]
+    )
+    return family.distort(distortion, from_pupil, extra=extra)
+
+
+def expose(
+    focal: Float[Array, "2"],
+    centre: Float[Array, "2"],
+    image_point: Float[Array, "2"],
+    ports: PortValues,
+) -> Float[Array, "2"]:
+    """Measured pixel (px) of an ideal image point: sensor and detection."""
+    if ports.plain:
+        return focal * image_point + centre
+    x, y = image_point
+    stretch = 1.0 + ports["sensor.focal"]
+    u = focal[0] * (stretch * (1.0 + ports["sensor.aspect"]) * x + ports["sensor.skew"] * y)
+    v = focal[1] * stretch * y
+    return centre + jnp.stack(
+        [
+            u + ports["sensor.cx"] + ports["detect.u"],
+            v + ports["sensor.cy"] + ports["detect.v"],
+        ]
+    )
+
+
+def predict_pixel(
+    family: LensFamily,
+    sight: Sight,
+    circumstances: Circumstances,
+    ports: PortValues,
+) -> Float[Array, "2"]:
+    """Predicted pixel (px) of one observation: the whole chain."""
+    at = circumstances
+    target = mark(sight.point, at.target_centre, at.target_half_size, ports)
+    delay = exposure_delay(at.pixel, at.image_height, ports)
+    world = place(pose_from_vector(sight.world_from_target), target, delay, at.velocity, ports)
+    camera = look(
+        pose_from_vector(sight.world_from_station),
+        pose_from_vector(sight.station_from_camera),
+        world,
+        ports,
+    )
+    apparent = refract(camera, ports)
+    return expose(sight.focal, sight.centre, image(family, sight.distortion, apparent, ports), ports)
+
+
+# --- rangefinder --------------------------------------------------------------------------------
+
+
+class Aim(NamedTuple):
+    """The unknowns that one range touches, gathered from the state."""
+
+    station_from_rangefinder: Float[Array, "6"]
+    world_from_station: Float[Array, "6"]
+    world_from_target: Float[Array, "6"]
+    point: Float[Array, "3"]
+
+
+def predict_range(
+    aim: Aim,
+    circumstances: Circumstances,
+    to_plane: Float[Array, ""],
+    ports: PortValues,
+) -> Float[Array, ""]:
+    """Predicted distance (m) from a rangefinder to a mark, or along its beam to a target's plane.
+
+    `to_plane` is 1 where the beam (the instrument's +z axis) meets the plane z = 0 of the target,
+    rho = n.(t - o) / (n.d), and 0 where the distance to the mark itself is measured.
+    """
+    at = circumstances
+    target = mark(aim.point, at.target_centre, at.target_half_size, ports)
+    pose = pose_from_vector(aim.world_from_target)
+    delay = ports["clock.offset"]
+    seen = look(
+        pose_from_vector(aim.world_from_station),
+        pose_from_vector(aim.station_from_rangefinder),
+        place(pose, target, delay, at.velocity, ports),
+        ports,
+    )
+    # A second mark, one metre along the plate's normal, gives the normal through the same chain.
+    ahead = look(
+        pose_from_vector(aim.world_from_station),
+        pose_from_vector(aim.station_from_rangefinder),
+        place(pose, target + jnp.array([0.0, 0.0, 1.0]), delay, at.velocity, ports),
+        ports,
+    )
+    normal = ahead - seen
+    along_normal = jnp.where(to_plane > 0.5, normal[2], 1.0)
+    distance = jnp.where(to_plane > 0.5, (normal @ seen) / along_normal, _safe_norm(seen))
+    return distance * (1.0 + ports["range.scale"]) + ports["range.offset"]
+
+
+def _safe_norm(vector: Float[Array, " n"]) -> Float[Array, ""]:
+    square = vector @ vector
+    away = square > 0.0
+    return jnp.where(away, jnp.sqrt(jnp.where(away, square, 1.0)), 0.0)

@@ -1,0 +1,208 @@
+"""Effects: `port x driver x form x scope`, kept as data.
+
+An `Effect` is the readable record; an `EffectTable` is the same as arrays of a fixed size, so that
+a model with other effects is another table and not another program. A term of an effect feeds one
+port, modulated by one observation-like driver; all terms share the time-like driver and its form.
+
+Port value of observation o from column j:
+
+    amplitude_j  x  course_j(epoch of o; constants)  x  pattern_j(o)
+
+The course is computed once per call for all epochs and gathered; the pattern (which camera, which
+target, how the row or the radius enters) is a table.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxvm.physics.forms import BASIS_INDEX, FORMS, Form, evaluate_basis
+from jaxvm.physics.ports import N_PORTS, PORT_INDEX
+
+
+@dataclass(frozen=True)
+class Scope:
+    """Which entities an effect touches; an empty tuple means all of that kind."""
+
+    camera: tuple[str, ...] = ()
+    station: tuple[str, ...] = ()
+    target: tuple[str, ...] = ()
+    point: tuple[str, ...] = ()
+    rangefinder: tuple[str, ...] = ()
+
+    def as_dict(self) -> dict[str, list[str]]:
+        """The kinds that are narrowed down, for a report or a file."""
+        kinds = ("camera", "station", "target", "point", "rangefinder")
+        return {kind: list(getattr(self, kind)) for kind in kinds if getattr(self, kind)}
+
+    def words(self) -> str:
+        """Reads in a sentence: "camera left", "everywhere"."""
+        parts = [f"{kind} {', '.join(names)}" for kind, names in self.as_dict().items()]
+        return "; ".join(parts) or "everywhere"
+
+
+@dataclass(frozen=True)
+class Term:
+    """One port of an effect and the pattern over observations with which it is fed."""
+
+    port: str
+    driver: str = "one"
+    basis: str = "one"
+    constants: tuple[float, ...] = ()
+    weight: float = 1.0
+
+
+@dataclass(frozen=True)
+class Effect:
+    """Physics in a model: terms (ports and patterns), a time-like driver, a form, a scope.
+
+    Attributes:
+        name: what an engineer calls it.
+        terms: the ports it feeds.
+        driver: name of a time-like channel, or "constant".
+        form: key of `jaxvm.physics.forms.FORMS`.
+        constants: nonlinear constants of the form (tau, period, ...).
+        reference: value from which a centred form counts its driver.
+        scope: the entities it touches.
+        amplitudes: one for each term and basis, term by term, in the unit of the port per unit of
+            the driver.
+        catalogue_id: entry of the catalogue, "" where it has no name.
+    """
+
+    name: str
+    terms: tuple[Term, ...]
+    driver: str = "constant"
+    form: str = "constant"
+    constants: tuple[float, ...] = ()
+    reference: float = 0.0
+    scope: Scope = field(default_factory=Scope)
+    amplitudes: tuple[float, ...] = ()
+    catalogue_id: str = ""
+
+    @property
+    def n_columns(self) -> int:
+        """Number of amplitudes: terms times bases."""
+        return len(self.terms) * len(FORMS[self.form].bases)
+
+    def with_values(self, amplitudes, constants) -> "Effect":
+        """The same effect with estimated amplitudes and constants."""
+        return replace(
+            self,
+            amplitudes=tuple(float(a) for a in amplitudes),
+            constants=tuple(float(c) for c in constants),
+        )
+
+
+class Channels(eqx.Module):
+    """Time-like drivers on one common grid of times, and how epochs read them.
+
+    Attributes:
+        names: channel names; the first is "constant" (all ones).
+        time: grid (s).
+        values: one row a channel.
+        epoch_time: time of each epoch (s).
+        kinds: for each channel "constant", "quantity", "time" or "power-on".
+    """
+
+    time: Float[Array, " times"]
+    values: Float[Array, "channels times"]
+    epoch_time: Float[Array, " epochs"]
+    names: tuple[str, ...] = eqx.field(static=True)
+    kinds: tuple[str, ...] = eqx.field(static=True)
+
+    def index(self, name: str) -> int:
+        """Row of a channel; KeyError with the known names otherwise."""
+        if name not in self.names:
+            known = ", ".join(self.names)
+            raise KeyError(f'there is no driver "{name}" in this recording (it has: {known})')
+        return self.names.index(name)
+
+    def mean(self, name: str) -> float:
+        """Mean of a channel over the epochs, the reference of centred forms."""
+        return float(np.mean(np.interp(self.epoch_time, self.time, self.values[self.index(name)])))
+
+    def at_epochs(self, courses: Float[Array, "n times"]) -> Float[Array, "n epochs"]:
+        """Courses on the grid, read at the epochs by linear interpolation."""
+        return jax.vmap(lambda y: jnp.interp(self.epoch_time, self.time, y))(courses)
+
+
+class EffectTable(eqx.Module):
+    """A list of effects as arrays. Unused columns have no port and no pattern."""
+
+    ports: Float[Array, "columns ports"]
+    channel: Int[Array, " columns"]
+    basis: Int[Array, " columns"]
+    reference: Float[Array, " columns"]
+    constant_index: Int[Array, "columns 2"]  # into the constants of the state; the last is unused
+
+    @property
+    def n_columns(self) -> int:
+        """Capacity of the table, used or not."""
+        return self.ports.shape[0]
+
+
+def tabulate(
+    effects: tuple[Effect, ...], channels: Channels, n_columns: int, n_constants: int
+) -> tuple[EffectTable, Float[np.ndarray, " columns"], Float[np.ndarray, " constants"]]:
+    """Effects as a table of given capacity, with their amplitudes and constants.
+
+    The last constant is always 1 and belongs to nobody: bases without constants read it.
+    """
+    ports = np.zeros((n_columns, N_PORTS))
+    channel = np.zeros(n_columns, int)
+    basis = np.zeros(n_columns, int)
+    reference = np.zeros(n_columns)
+    constant_index = np.full((n_columns, 2), n_constants - 1)
+    amplitudes = np.zeros(n_columns)
+    constants = np.ones(n_constants)
+    column, first_constant = 0, 0
+    for effect in effects:
+        form = FORMS[effect.form]
+        own = [first_constant + k for k in range(len(effect.constants))]
+        constants[own] = effect.constants
+        given = effect.amplitudes or (0.0,) * effect.n_columns
+        for term in effect.terms:
+            for name in form.bases:
+                ports[column, PORT_INDEX[term.port]] = term.weight
+                channel[column] = channels.index(effect.driver)
+                basis[column] = BASIS_INDEX[name]
+                reference[column] = effect.reference if form.centred else 0.0
+                constant_index[column, : len(own)] = own
+                amplitudes[column] = given[column - _start(effects, effect)]
+                column += 1
+        first_constant += len(own)
+    table = EffectTable(*map(jnp.asarray, (ports, channel, basis, reference, constant_index)))
+    return table, amplitudes, constants
+
+
+def _start(effects: tuple[Effect, ...], effect: Effect) -> int:
+    before = effects[: next(i for i, e in enumerate(effects) if e is effect)]
+    return sum(e.n_columns for e in before)
+
+
+def capacity(effects: tuple[Effect, ...]) -> tuple[int, int]:
+    """Rounded-up numbers of columns and constants, so that one more effect is no new program."""
+    columns = sum(e.n_columns for e in effects)
+    constants = sum(len(e.constants) for e in effects)
+    if columns == 0:
+        return 0, 1
+    return 8 * -(-columns // 8), 4 * -(-(constants + 1) // 4)
+
+
+def courses(
+    table: EffectTable, constants: Float[Array, " constants"], channels: Channels
+) -> Float[Array, "columns epochs"]:
+    """Course of every column at the epochs. Differentiable in the constants."""
+    x = channels.values[table.channel] - table.reference[:, None]
+    own = constants[table.constant_index]
+    on_grid = jax.vmap(lambda b, xi, c: evaluate_basis(b, xi, channels.time, c))(table.basis, x, own)
+    return channels.at_epochs(on_grid)
+
+
+def form_of(effect: Effect) -> Form:
+    """The form record of an effect."""
+    return FORMS[effect.form]

@@ -1,0 +1,160 @@
+"""Forms: how a driver becomes the course of an effect.
+
+A *basis* is one function of a driver's course x over times t, with up to two constants. A *form* is
+one or several bases that share their constants: a periodic effect is a sine and a cosine of one
+period. Everything is written for one course; tables of effects `vmap` over it.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+Course = Float[Array, " times"]
+Constants = Float[Array, "2"]
+
+
+def first_order_lag(x: Course, t: Course, tau: Float[Array, ""]) -> Course:
+    """Course of tau dy/dt + y = x, in equilibrium at the first sample.
+
+    Exact for a driver that is linear between samples (first-order hold), whatever the sampling:
+    y1 = a y0 + (1-a) x0 + (x1-x0) (1 - (1-a) tau/dt), a = exp(-dt/tau) (MATHEMATICS 1.5).
+    """
+    dt = jnp.diff(t)
+    rest = -jnp.expm1(-dt / tau)
+    drive = rest * x[:-1] + jnp.diff(x) * (1.0 - rest * tau / dt)
+
+    def step(y, inputs):
+        rest_k, drive_k = inputs
+        y = (1.0 - rest_k) * y + drive_k
+        return y, y
+
+    _, rest_of_course = jax.lax.scan(step, x[0], (rest, drive))
+    return jnp.concatenate([x[:1], rest_of_course])
+
+
+def play(x: Course, half_width: Float[Array, ""]) -> Course:
+    """Play (backlash) operator of Prandtl and Ishlinskii: follows x with free travel either way.
+
+    The contact starts in the middle of its travel at the first sample.
+    """
+
+    def step(y, x_k):
+        y = jnp.clip(y, x_k - half_width, x_k + half_width)
+        return y, y
+
+    return jax.lax.scan(step, x[0], x)[1]
+
+
+def rate(x: Course, t: Course) -> Course:
+    """Rate of change of x (driver's unit per hour), by central differences."""
+    return jnp.gradient(x, t / 3600.0)
+
+
+def bump(x: Course, centre: Float[Array, ""], width: Float[Array, ""]) -> Course:
+    """Cubic B-spline of knot distance `width` about `centre`; bumps on a regular grid sum to 1."""
+    s = jnp.abs((x - centre) / width)
+    inner = 2.0 / 3.0 - s**2 + 0.5 * s**3
+    outer = (2.0 - s) ** 3 / 6.0
+    return jnp.where(s < 1.0, inner, jnp.where(s < 2.0, outer, 0.0))
+
+
+BASES: dict[str, Callable[[Course, Course, Constants], Course]] = {
+    "one": lambda x, t, c: jnp.ones_like(x),
+    "linear": lambda x, t, c: x,
+    "square": lambda x, t, c: x**2,
+    "cube": lambda x, t, c: x**3,
+    "fourth": lambda x, t, c: x**4,
+    "sixth": lambda x, t, c: x**6,
+    "lag": lambda x, t, c: first_order_lag(x, t, c[0]),
+    "slow lag": lambda x, t, c: first_order_lag(x, t, c[1]),
+    "rate": lambda x, t, c: rate(x, t),
+    "direction": lambda x, t, c: jnp.tanh(rate(x, t) / c[0]),
+    "play": lambda x, t, c: play(x, c[0]) - x,
+    "onset": lambda x, t, c: -jnp.expm1(-jnp.maximum(x, 0.0) / c[0]),
+    "log": lambda x, t, c: jnp.log1p(jnp.maximum(x, 0.0) / c[0]),
+    "step": lambda x, t, c: jnp.where(x >= c[0], 1.0, 0.0),
+    "ramp": lambda x, t, c: jnp.maximum(x - c[0], 0.0),
+    "sine": lambda x, t, c: jnp.sin(2.0 * jnp.pi * x / c[0]),
+    "cosine": lambda x, t, c: jnp.cos(2.0 * jnp.pi * x / c[0]),
+    "bump": lambda x, t, c: bump(x, c[0], c[1]),
+}
+"""All bases by name. Those that use `t` remember the past and apply to time courses only."""
+
+BASIS_INDEX = {name: index for index, name in enumerate(BASES)}
+
+
+def evaluate_basis(
+    basis: Int[Array, ""], x: Course, t: Course, constants: Constants
+) -> Float[Array, " times"]:
+    """Course of the basis with number `basis`; the number is data, so nothing is recompiled."""
+    return jnp.stack([function(x, t, constants) for function in BASES.values()])[basis]
+
+
+@dataclass(frozen=True)
+class Constant:
+    """A nonlinear constant of a form: its name, unit, and the range it may take."""
+
+    name: str
+    unit: str
+    refined: bool = True
+    """Whether a refit may move it (a step's instant has no derivative)."""
+
+
+@dataclass(frozen=True)
+class Form:
+    """A named form: its bases, its constants, and how it reads in a sentence."""
+
+    name: str
+    bases: tuple[str, ...]
+    constants: tuple[Constant, ...]
+    words: str
+    centred: bool = False
+    """Whether the driver is counted from its reference value (its mean over the recording)."""
+
+
+_TAU = Constant("time constant", "s")
+
+FORMS: dict[str, Form] = {
+    form.name: form
+    for form in (
+        Form("constant", ("one",), (), "always the same"),
+        Form("linear", ("linear",), (), "in proportion to {driver}", centred=True),
+        Form("quadratic", ("linear", "square"), (), "as a parabola of {driver}", centred=True),
+        Form("lag", ("lag",), (_TAU,), "following {driver} with a lag", centred=True),
+        Form(
+            "two lags",
+            ("lag", "slow lag"),
+            (_TAU, Constant("slow time constant", "s")),
+            "following {driver} with two time constants",
+            centred=True,
+        ),
+        Form("rate", ("rate",), (), "in proportion to the rate of {driver}"),
+        Form(
+            "direction",
+            ("direction",),
+            (Constant("rate of half play", "driver/h"),),
+            "with the direction in which {driver} moves",
+        ),
+        Form(
+            "hysteresis",
+            ("linear", "play"),
+            (Constant("half play", "driver"),),
+            "with {driver} and with backlash",
+            centred=True,
+        ),
+        Form("onset", ("onset",), (_TAU,), "settling exponentially with {driver}"),
+        Form("creep", ("log",), (_TAU,), "creeping with the logarithm of {driver}"),
+        Form("step", ("step",), (Constant("instant", "s", refined=False),), "suddenly, in {driver}"),
+        Form("ramp", ("ramp",), (Constant("start", "s"),), "steadily from a moment in {driver} on"),
+        Form(
+            "periodic",
+            ("sine", "cosine"),
+            (Constant("period", "driver"),),
+            "periodically in {driver}",
+        ),
+    )
+}
+"""The forms of time-like drivers, by name."""

@@ -1,0 +1,1 @@
+"""Solvers on the one residual: adjustment, covariance, data snooping, robust losses."""

@@ -1,0 +1,203 @@
+"""Adjustment of a scene, and the summary that a surveyor reads."""
+
+import time
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+
+from jaxvm.network.residual import Residuals
+from jaxvm.network.scene import Scene
+from jaxvm.solve.compiling import compile_seconds
+from jaxvm.solve.gauge import check_gauge
+from jaxvm.solve.optimise import METHODS
+from jaxvm.solve.problem import Normal, Problem, normal_at_start, scaled, scene_problem
+from jaxvm.solve.robust import Loss
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """Result of an adjustment.
+
+    Attributes:
+        scene: the scene at the adjusted values.
+        problem: the scaled problem about the start; `x` is its solution.
+        x: scaled increments.
+        cost_before, cost: half the sum of (robust) squared whitened residuals.
+        degrees_of_freedom: observations minus unknowns.
+        evaluations, accepted: steps tried and taken.
+        history: cost after each evaluation.
+        why: why it stopped.
+        seconds, seconds_compiling: of this call.
+    """
+
+    scene: Scene
+    problem: Problem
+    x: jax.Array
+    cost_before: float
+    cost: float
+    degrees_of_freedom: int
+    evaluations: int
+    accepted: int
+    history: np.ndarray
+    why: str
+    seconds: float
+    seconds_compiling: float
+
+    @property
+    def variance_factor(self) -> float:
+        """Chi-square per degree of freedom: 1 when the model and the sigmas are right."""
+        return 2.0 * self.cost / max(self.degrees_of_freedom, 1)
+
+    @property
+    def converged(self) -> bool:
+        """Whether it stopped at a minimum."""
+        return self.why.startswith("converged")
+
+    def residuals(self) -> Residuals:
+        """Whitened residuals at the solution, without the padding of the tables."""
+        padded = _residuals(self.problem, self.x)
+        pixels = tuple(
+            block[: len(rows)] for block, rows in zip(padded.pixels, self.scene.tables, strict=True)
+        )
+        return padded._replace(pixels=pixels)
+
+    def summary(self) -> str:
+        """A few lines: cost, iterations, why it stopped, where the time went."""
+        rms = pixel_rms(self.scene, self.residuals())
+        return "\n".join(
+            [
+                f"cost               {self.cost_before:.6g} -> {self.cost:.8g}",
+                f"variance factor    {self.variance_factor:.4g}"
+                f"  ({self.degrees_of_freedom} degrees of freedom)",
+                f"pixel RMS          {rms:.4f} px (weighted)",
+                f"steps              {self.accepted} accepted of {self.evaluations}",
+                f"stopped            {self.why}",
+                f"time               {self.seconds:.2f} s, of which compiling"
+                f" {self.seconds_compiling:.2f} s",
+            ]
+        )
+
+
+def adjust(
+    scene: Scene,
+    method: str = "levenberg-marquardt",
+    loss: Loss | None = None,
+    weights: tuple[np.ndarray, ...] | None = None,
+    active: np.ndarray | None = None,
+    max_steps: int = 100,
+    check: bool = True,
+) -> Adjustment:
+    """Adjust a scene: find the free parameters that minimise the whitened residuals.
+
+    Args:
+        scene: scene at its start values.
+        method: "levenberg-marquardt" or "gauss-newton".
+        loss: robust loss; least squares by default.
+        weights: weight of every observation of every pixel table (0 sets it aside).
+        active: unknowns that may move; all by default.
+        max_steps: bound on evaluations.
+        check: look for rank deficiency first.
+
+    Raises:
+        RankDeficiency: unknowns that the observations don't determine, by name.
+        ValueError: an unknown method.
+    """
+    if method not in METHODS:
+        raise ValueError(f'there is no method "{method}" (there are: {", ".join(METHODS)})')
+    began, compiling = time.perf_counter(), compile_seconds()
+    problem = scene_problem(scene, loss)
+    if weights is not None:
+        problem = with_weights(problem, weights)
+    if active is not None:
+        problem = eqx.tree_at(lambda p: p.active, problem, problem.active & jnp.asarray(active))
+    problem, normal = scaled(problem, normal_at_start(problem))
+    if check:
+        check_gauge(normal, scene.unknowns)
+    solution = _minimise(problem, METHODS[method](), max_steps)
+    x = solution.value
+    stats = solution.stats
+    history = np.asarray(stats["history"])
+    history = history[~np.isnan(history)]
+    state = _state(problem, x)
+    why = _why(solution, stats, max_steps)
+    return Adjustment(
+        scene=scene.with_state(state),
+        problem=problem,
+        x=x,
+        cost_before=float(history[0]) if len(history) else float("nan"),
+        cost=float(history[-1]) if len(history) else float("nan"),
+        degrees_of_freedom=degrees_of_freedom(problem, normal),
+        evaluations=int(stats["evaluations"]),
+        accepted=int(stats["accepted"]),
+        history=history,
+        why=why,
+        seconds=time.perf_counter() - began,
+        seconds_compiling=compile_seconds() - compiling,
+    )
+
+
+def with_weights(problem: Problem, weights: tuple[np.ndarray, ...]) -> Problem:
+    """The problem with other weights of the image points, one vector for each pixel table."""
+    padded = []
+    for factor, own in zip(problem.network.pixels, weights, strict=True):
+        padded.append(jnp.asarray(np.append(own, np.zeros(factor.slots.shape[0] - len(own)))))
+    return eqx.tree_at(lambda p: [f.weight for f in p.network.pixels], problem, padded)
+
+
+def degrees_of_freedom(problem: Problem, normal: Normal) -> int:
+    """Weighted-in observations minus unknowns that any of them touches."""
+    used = sum(
+        int(np.sum(np.asarray(f.weight) > 0)) * f.sigma.shape[1] for f in problem.network.factors()
+    )
+    return used - int(np.sum(np.asarray(normal.hessian.diagonal()) > 0))
+
+
+@eqx.filter_jit
+def _minimise(problem: Problem, solver, max_steps: int):
+    return optx.least_squares(
+        lambda x, p: p.residual(x),
+        solver,
+        jnp.zeros(problem.n),
+        args=problem,
+        max_steps=max_steps,
+        throw=False,
+    )
+
+
+@eqx.filter_jit
+def _state(problem: Problem, x):
+    return problem.state(x)
+
+
+@eqx.filter_jit
+def _residuals(problem: Problem, x):
+    return problem.residual(x)
+
+
+def _why(solution, stats, max_steps) -> str:
+    if solution.result == optx.RESULTS.successful:
+        return "converged: the cost no longer changes"
+    if int(stats["evaluations"]) >= max_steps:
+        return f"stopped after {max_steps} evaluations: not converged"
+    return "failed: the normal equations are singular"
+
+
+def pixel_rms(scene: Scene, residuals: Residuals, rows=None) -> float:
+    """Weighted RMS of pixel residuals in units of the noise the recording states for sigma = 1.
+
+    Each component counts with (median sigma / sigma)^2: with the detector's weights w = 1/sigma it
+    is the RMS of w * (predicted - measured) in pixels.
+    """
+    square = np.concatenate([np.asarray(block) ** 2 for block in residuals.pixels])
+    chosen = square if rows is None else square[rows]
+    return float(np.sqrt(np.mean(chosen)) * reference_sigma(scene))
+
+
+def reference_sigma(scene: Scene) -> float:
+    """Sigma (px) that pixel residuals are quoted for: the most frequent one of the recording."""
+    values, counts = np.unique(scene.recording.observations.sigma, return_counts=True)
+    return float(values[np.argmax(counts)])

@@ -1,0 +1,61 @@
+"""Covariance of any quantity of an adjusted scene, and the precision of its unknowns.
+
+The covariance of q(state) is Q H^-1 Q^T with Q = dq/dx and H the Gauss-Newton matrix; it is never
+formed for all unknowns. `scale` multiplies it: 1 trusts the stated sigmas, the variance factor
+trusts the residuals.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxvm.network.state import State
+from jaxvm.solve.adjust import Adjustment
+from jaxvm.solve.arrow import factorise
+from jaxvm.solve.problem import Problem
+
+
+def covariance(
+    adjustment: Adjustment,
+    quantity: Callable[[State], Float[Array, " m"]],
+    scale: float = 1.0,
+) -> Float[Array, "m m"]:
+    """Covariance (units of the quantity, squared) of `quantity(state)` at the solution.
+
+    `quantity` must be differentiable; it may combine any fields of the state, such as the pose of
+    one target relative to another.
+    """
+    return scale * _covariance(adjustment.problem, adjustment.x, quantity)
+
+
+@eqx.filter_jit
+def _covariance(problem: Problem, x, quantity):
+    factors = factorise(problem.normal(x).hessian)
+    rows = jax.jacrev(lambda y: jnp.ravel(quantity(problem.state(y))))(x)
+    return rows @ factors.solve(rows.T)
+
+
+def standard_deviations(adjustment: Adjustment, scale: float = 1.0) -> State:
+    """Standard deviation of every parameter of the state; zero where it is held."""
+    flat = _marginals(adjustment.problem, adjustment.x)
+    return adjustment.problem.network.layout.restore(jnp.sqrt(scale) * flat)
+
+
+@eqx.filter_jit
+def _marginals(problem: Problem, x):
+    """Square roots of the diagonal of H^-1, in the units of the parameters."""
+    factors = factorise(problem.normal(x).hessian)
+    s, groups, d = problem.sizes
+    shared = jnp.linalg.inv(factors.reduced) if s else jnp.zeros((0, 0))
+    half = jax.vmap(jnp.linalg.inv)(factors.local) if groups else jnp.zeros((0, d, d))
+    # V^-1 and its correction V^-1 W S^-1 W^T V^-1 through the shared unknowns.
+    spread = jnp.einsum("gea,ges->gas", half, factors.coupled)
+    through = jnp.einsum("gas,ts->gat", spread, shared)
+    local = jnp.sum(half**2, axis=1) + jnp.sum(through**2, axis=2)
+    variance = jnp.concatenate([jnp.sum(shared**2, axis=0), jnp.ravel(local), jnp.zeros(1)])
+    active = jnp.concatenate([problem.active, jnp.zeros(1, bool)])
+    variance = jnp.where(active, variance, 0.0)
+    return jnp.abs(problem.factor) * jnp.sqrt(variance[problem.column])

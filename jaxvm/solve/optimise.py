@@ -1,0 +1,149 @@
+"""Gauss-Newton and Levenberg-Marquardt on normal equations, as one optimistix solver.
+
+optimistix's own least-squares solvers hand a linear solver the whole Jacobian; here the problem
+(`jaxvm.solve.problem.Problem`, passed as `args`) gives its normal equations in arrow form, and
+optimistix's descents (Newton, damped Newton) and searches (learning rate, trust region) do the rest.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxvm.solve.arrow import ArrowCholesky
+
+_HISTORY = 512
+
+
+class _State(eqx.Module):
+    first: Bool[Array, ""]
+    trial: Float[Array, " n"]
+    info: Any
+    search: Any
+    descent: Any
+    done: Bool[Array, ""]
+    result: optx.RESULTS
+    evaluations: Int[Array, ""]
+    accepted: Int[Array, ""]
+    history: Float[Array, " steps"]  # accepted cost after each evaluation
+
+
+class Relaxing(optx.ClassicalTrustRegion):
+    """Trust region that starts near Gauss-Newton and opens fast.
+
+    Unknowns are scaled to a unit diagonal, so the damping is relative: it starts at 1e-3.
+    """
+
+    high_cutoff: float = 0.75
+    low_cutoff: float = 1e-4
+    high_constant: float = 10.0
+    low_constant: float = 0.1
+
+    def init(self, y, f_info_struct):
+        state = super().init(y, f_info_struct)
+        return eqx.tree_at(lambda s: s.step_size, state, jnp.array(1e3))
+
+
+class NormalEquationSolver(optx.AbstractLeastSquaresSolver):
+    """Least squares by normal equations: a descent, a search, and a statistical stopping rule.
+
+    The problem is passed as `args`. It stops when a hardly damped step changes the cost by less
+    than `rtol` of itself plus `atol`, or when damping can't find a lower cost any more. The cost is
+    half a chi-square, so a change of `atol` moves no combination of unknowns by more than
+    sqrt(2 atol) of its standard deviation.
+    """
+
+    rtol: float
+    atol: float
+    norm: Any
+    descent: optx.AbstractDescent
+    search: optx.AbstractSearch
+
+    def _info(self, y, problem):
+        normal = problem.normal(y)
+        return optx.FunctionInfo.EvalGradHessian(normal.cost, normal.gradient, normal.hessian)
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+        shape = eqx.filter_eval_shape(self._info, y, args)
+        blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape)
+        return _State(
+            first=jnp.array(True),
+            trial=y,
+            info=blank,
+            search=self.search.init(y, shape),
+            descent=self.descent.init(y, blank),
+            done=jnp.array(False),
+            result=optx.RESULTS.successful,
+            evaluations=jnp.array(0),
+            accepted=jnp.array(0),
+            history=jnp.full(_HISTORY, jnp.nan),
+        )
+
+    def step(self, fn, y, args, options, state, tags):
+        info = self._info(state.trial, args)
+        size, accept, search_result, search = self.search.step(
+            state.first, y, state.trial, state.info, info, state.search
+        )
+        accept = accept & (jnp.isfinite(info.f) | state.first)
+        gained = state.info.f - info.f
+        settled = (jnp.abs(gained) <= self.rtol * info.f + self.atol) & (size >= 1.0)
+        stuck = ~accept & (size < 1e-12)
+        done = ~state.first & ((accept & settled) | stuck)
+
+        def choose(new, old):
+            return jax.tree.map(lambda a, b: jnp.where(accept, a, b), new, old)
+
+        y = jnp.where(accept, state.trial, y)
+        kept = choose(info, state.info)
+        descent = self.descent.query(y, kept, state.descent)
+        change, descent_result = self.descent.step(size, descent)
+        # A damped matrix that is not positive definite gives no step: damp more and try again.
+        failed = descent_result != optx.RESULTS.successful
+        hopeless = failed & (size < 1e-12)
+        result = optx.RESULTS.where(hopeless, descent_result, search_result)
+        state = _State(
+            first=jnp.array(False),
+            trial=y + change,
+            info=kept,
+            search=search,
+            descent=descent,
+            done=done | hopeless,
+            result=result,
+            evaluations=state.evaluations + 1,
+            accepted=state.accepted + accept,
+            history=state.history.at[state.evaluations].set(kept.f, mode="drop"),
+        )
+        return y, state, None
+
+    def terminate(self, fn, y, args, options, state, tags):
+        return state.done, state.result
+
+    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        return y, aux, {
+            "evaluations": state.evaluations,
+            "accepted": state.accepted,
+            "history": state.history,
+        }  # fmt: skip
+
+
+def gauss_newton(rtol: float = 1e-12, atol: float = 1e-9) -> NormalEquationSolver:
+    """Full Gauss-Newton steps: fastest near the solution, may diverge far from it."""
+    return NormalEquationSolver(
+        rtol, atol, optx.max_norm, optx.NewtonDescent(linear_solver=ArrowCholesky()),
+        optx.LearningRate(1.0),
+    )  # fmt: skip
+
+
+def levenberg_marquardt(rtol: float = 1e-12, atol: float = 1e-9) -> NormalEquationSolver:
+    """Damped steps with a trust region: the default."""
+    return NormalEquationSolver(
+        rtol, atol, optx.max_norm, optx.DampedNewtonDescent(linear_solver=ArrowCholesky()),
+        Relaxing(),
+    )  # fmt: skip
+
+
+METHODS = {"gauss-newton": gauss_newton, "levenberg-marquardt": levenberg_marquardt}
+"""Methods of `adjust` by name."""

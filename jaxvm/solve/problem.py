@@ -1,0 +1,233 @@
+"""The least-squares problem of a scene: cost, gradient and normal equations as functions of x.
+
+The unknowns x are scaled increments of the free parameters about the scene's state (`Unknowns`).
+Observations that touch the same unknowns form a *packet*: their products are one batched matrix
+product, and only the small packet blocks are scattered into the arrow.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxvm.network.factors import Factor, rounded
+from jaxvm.network.residual import Network, Residuals, block_jacobian, residual, whitening
+from jaxvm.network.scene import Scene
+from jaxvm.network.state import Layout, State
+from jaxvm.network.unknowns import Unknowns
+from jaxvm.solve.arrow import Arrow
+from jaxvm.solve.robust import Loss, SquaredLoss
+
+
+class Packets(eqx.Module):
+    """How the rows of one table fall into packets.
+
+    `live` are the positions along [own slots, amplitudes, constants] that are free somewhere;
+    `rows` lists the observations of each packet, filled up with the number of observations.
+    """
+
+    rows: Int[Array, "packets width"]
+    columns: Int[Array, "packets live"]
+    live: tuple[int, ...] = eqx.field(static=True)
+
+    @property
+    def n_observations(self) -> int:
+        """Number of packets times their width."""
+        return self.rows.shape[0] * self.rows.shape[1]
+
+
+def pack(factor: Factor, layout: Layout, unknowns: Unknowns) -> Packets:
+    """Group the observations of a table by the unknowns that they touch."""
+    own = np.asarray(factor.slots)[: factor.n_real]
+    effects = np.concatenate([layout.all("amplitude"), layout.all("constant")])
+    slots = np.concatenate([own, np.tile(effects, (len(own), 1))], axis=1)
+    columns = unknowns.column[slots]
+    live = np.flatnonzero((columns < unknowns.n).any(axis=0))
+    columns = columns[:, live]
+    distinct, packet = np.unique(columns, axis=0, return_inverse=True)
+    packet = packet.ravel()
+    counts = np.bincount(packet, minlength=len(distinct))
+    order = np.argsort(packet, kind="stable")
+    starts = np.concatenate([[0], np.cumsum(counts)])[:-1]
+    rank = np.arange(len(packet)) - starts[packet[order]]
+    width = rounded(counts.max(initial=1))
+    rows = np.full((len(distinct), width), factor.slots.shape[0])
+    rows[packet[order], rank] = order
+    return Packets(jnp.asarray(rows), jnp.asarray(distinct), tuple(int(k) for k in live))
+
+
+class Normal(eqx.Module):
+    """Cost, gradient and Gauss-Newton matrix at one x."""
+
+    cost: Float[Array, ""]
+    gradient: Float[Array, " n"]
+    hessian: Arrow
+
+
+class Problem(eqx.Module):
+    """A scene as a function of its unknowns.
+
+    Attributes:
+        network: tables and effects.
+        base: flat state at x = 0.
+        column: unknown of each position of the flat state; `n` where held.
+        factor: change of the parameter for a unit change of its unknown.
+        active: unknowns that may move; the others stay at zero.
+        loss: robust loss of whitened residuals.
+    """
+
+    network: Network
+    packets: tuple[Packets, ...]
+    base: Float[Array, " parameters"]
+    column: Int[Array, " parameters"]
+    factor: Float[Array, " parameters"]
+    active: Bool[Array, " n"]
+    loss: Loss
+    sizes: tuple[int, int, int] = eqx.field(static=True)  # shared, groups, group size
+
+    @property
+    def n(self) -> int:
+        """Length of x."""
+        s, groups, d = self.sizes
+        return s + groups * d
+
+    def flat(self, x: Float[Array, " n"]) -> Float[Array, " parameters"]:
+        """Flat state at x."""
+        moved = jnp.concatenate([jnp.where(self.active, x, 0.0), jnp.zeros(1)])
+        return self.base + self.factor * moved[self.column]
+
+    def state(self, x: Float[Array, " n"]) -> State:
+        """State at x."""
+        return self.network.layout.restore(self.flat(x))
+
+    def residual(self, x: Float[Array, " n"]) -> Residuals:
+        """Whitened residuals at x, through the one residual function."""
+        return residual(self.state(x), self.network)
+
+    def cost(self, x: Float[Array, " n"]) -> Float[Array, ""]:
+        """Half the sum of the losses."""
+        blocks = jax.tree.leaves(self.residual(x))
+        squares = [jnp.sum(self.loss.value(jnp.sum(block**2, axis=1))) for block in blocks]
+        return 0.5 * jnp.sum(jnp.stack(squares))
+
+    def jacobian(self, factor: Factor, packets: Packets, flat) -> Float[Array, "obs comps live"]:
+        """Whitened block Jacobian of a table with respect to the unknowns of its live slots."""
+        effects = jnp.concatenate(
+            [
+                jnp.asarray(self.network.layout.all("amplitude")),
+                jnp.asarray(self.network.layout.all("constant")),
+            ]
+        )
+        n = factor.slots.shape[0]
+        slots = jnp.concatenate(
+            [factor.slots, jnp.broadcast_to(effects, (n, effects.shape[0]))], axis=1
+        )[:, jnp.asarray(packets.live)]
+        moving = jnp.concatenate([self.active, jnp.zeros(1, bool)])[self.column]
+        per_unknown = jnp.where(moving, self.factor, 0.0)[slots]
+        blocks = block_jacobian(factor, self.network, flat, packets.live)
+        return blocks * whitening(factor)[:, :, None] * per_unknown[:, None, :]
+
+    def normal(self, x: Float[Array, " n"]) -> Normal:
+        """Cost, gradient and Gauss-Newton matrix, with the weights of the robust loss."""
+        flat = self.flat(x)
+        s, groups, d = self.sizes
+        cost = jnp.zeros(())
+        gradient = jnp.zeros(self.n + 1)
+        shared = jnp.zeros((s + 1, s + 1))
+        coupling = jnp.zeros((groups + 1, d + 1, s + 1))
+        local = jnp.zeros((groups + 1, d + 1, d + 1))
+        blocks = jax.tree.leaves(self.residual(x))
+        for factor, packets, r in zip(self.network.factors(), self.packets, blocks, strict=True):
+            square = jnp.sum(r**2, axis=1)
+            cost = cost + 0.5 * jnp.sum(self.loss.value(square))
+            root = jnp.sqrt(self.loss.weight(square))[:, None]
+            gram, product = packet_products(
+                packets, self.jacobian(factor, packets, flat) * root[:, :, None], r * root
+            )
+            place, group, member = split_columns(packets.columns, self.sizes)
+            gradient = gradient.at[packets.columns].add(product)
+            shared = shared.at[place[:, :, None], place[:, None, :]].add(gram)
+            if groups:
+                where = group[:, None, None]
+                coupling = coupling.at[where, member[:, :, None], place[:, None, :]].add(gram)
+                local = local.at[where, member[:, :, None], member[:, None, :]].add(gram)
+        arrow = Arrow(shared[:s, :s], coupling[:groups, :d, :s], local[:groups, :d, :d])
+        return Normal(cost, gradient[: self.n], arrow)
+
+
+def packet_products(
+    packets: Packets,
+    jacobian: Float[Array, "obs comps live"],
+    values: Float[Array, "obs comps *k"],
+) -> tuple[Float[Array, "packets live live"], Float[Array, "packets live *k"]]:
+    """J^T J and J^T values of every packet."""
+    j = in_packets(packets, jacobian)
+    v = in_packets(packets, values if values.ndim == 3 else values[:, :, None])
+    gram = jnp.einsum("prk,prl->pkl", j, j)
+    product = jnp.einsum("prk,prm->pkm", j, v)
+    return gram, product if values.ndim == 3 else product[:, :, 0]
+
+
+def in_packets(packets: Packets, values: Float[Array, "obs comps k"]) -> Float[Array, "p r k"]:
+    """Rows of a table gathered packet by packet, filled up with zeros."""
+    padded = jnp.concatenate([values, jnp.zeros((1, *values.shape[1:]))])
+    gathered = padded[packets.rows]
+    p, width, components, k = gathered.shape
+    return jnp.reshape(gathered, (p, width * components, k))
+
+
+def split_columns(columns: Int[Array, "packets live"], sizes: tuple[int, int, int]):
+    """Shared index, group of the packet, and member index of each live slot.
+
+    A slot that is not shared has the shared index s, one that is not local the member index d.
+    """
+    s, groups, d = sizes
+    is_local = (columns >= s) & (columns < s + groups * d)
+    offset = jnp.where(is_local, columns - s, 0)
+    place = jnp.where(columns < s, columns, s)
+    member = jnp.where(is_local, offset % max(d, 1), d)
+    group = jnp.max(jnp.where(is_local, offset // max(d, 1), -1), axis=1)
+    return place, jnp.where(group < 0, groups, group), member
+
+
+def scene_problem(scene: Scene, loss: Loss | None = None) -> Problem:
+    """The least-squares problem of a scene, unscaled: x are plain increments."""
+    unknowns = scene.unknowns
+    layout = scene.network.layout
+    return Problem(
+        network=scene.network,
+        packets=tuple(pack(f, layout, unknowns) for f in scene.network.factors()),
+        base=scene.state.flatten(),
+        column=jnp.asarray(unknowns.column),
+        factor=jnp.asarray(unknowns.factor, float),
+        active=jnp.asarray(unknowns.active),
+        loss=SquaredLoss() if loss is None else loss,
+        sizes=(unknowns.n_shared, unknowns.n_groups, unknowns.group_size),
+    )
+
+
+@eqx.filter_jit
+def normal_at_start(problem: Problem) -> Normal:
+    """Cost, gradient and normal matrix of a problem at x = 0."""
+    return problem.normal(jnp.zeros(problem.n))
+
+
+def scaled(problem: Problem, normal: Normal) -> tuple[Problem, Normal]:
+    """The problem with unknowns scaled to a unit diagonal, and its normal equations at x = 0."""
+    diagonal = np.asarray(normal.hessian.diagonal())
+    scale = np.where(diagonal > 0.0, 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0)), 1.0)
+    per_parameter = np.append(scale, 1.0)[np.asarray(problem.column)]
+    problem = eqx.tree_at(lambda p: p.factor, problem, problem.factor * per_parameter)
+    return problem, _rescale(normal, jnp.asarray(scale))
+
+
+@jax.jit
+def _rescale(normal: Normal, scale: Float[Array, " n"]) -> Normal:
+    a, b = normal.hessian.split(scale)
+    arrow = Arrow(
+        a[:, None] * normal.hessian.shared * a,
+        b[:, :, None] * normal.hessian.coupling * a,
+        b[:, :, None] * normal.hessian.local * b[:, None, :],
+    )
+    return Normal(normal.cost, normal.gradient * scale, arrow)
