@@ -37,9 +37,9 @@ class Course(NamedTuple):
 
 
 class Row(NamedTuple):
-    """The values at an observation's slots, split into its own parameters and the effects'."""
+    """The values at an observation's slots: its own parameters, part by part, and the effects'."""
 
-    own: Float[Array, " slots"]
+    own: tuple[Float[Array, " part"], ...]
     amplitude: Float[Array, " columns"]
     constant: Float[Array, " constants"]
 
@@ -71,6 +71,11 @@ class Factor(eqx.Module):
     def n_real(self) -> int:
         """Number of observations without the padding at the end of the table."""
         return self.slots.shape[0]
+
+    @property
+    def widths(self) -> tuple[int, ...]:
+        """How many slots each parameter has: a focal length 2, a pose 6, a point 3."""
+        raise NotImplementedError
 
     def data(self):
         """PyTree of the recorded values; its leaves lead with the observations."""
@@ -104,21 +109,12 @@ class PixelFactor(Factor):
     def data(self):
         return self.circumstances
 
-    def sight(self, own: Float[Array, " slots"]) -> Sight:
-        """Parameters of one observation from the values at its slots."""
-        n = self.family.n_coefficients
-        return Sight(
-            focal=own[0:2],
-            centre=own[2:4],
-            station_from_camera=own[4:10],
-            world_from_station=own[10:16],
-            world_from_target=own[16:22],
-            point=own[22:25],
-            distortion=own[25 : 25 + n],
-        )
+    @property
+    def widths(self):
+        return (2, 2, self.family.n_coefficients, 6, 6, 6, 3)
 
     def local(self, own, data, ports):
-        return predict_pixel(self.family, self.sight(own), data, ports) - data.pixel
+        return predict_pixel(self.family, Sight(*own), data, ports) - data.pixel
 
 
 class RangeFactor(Factor):
@@ -136,10 +132,13 @@ class RangeFactor(Factor):
     def data(self):
         return self.circumstances, self.to_plane, self.measured
 
+    @property
+    def widths(self):
+        return (6, 6, 6, 3)
+
     def local(self, own, data, ports):
         circumstances, to_plane, measured = data
-        aim = Aim(own[0:6], own[6:12], own[12:18], own[18:21])
-        return (predict_range(aim, circumstances, to_plane, ports) - measured)[None]
+        return (predict_range(Aim(*own), circumstances, to_plane, ports) - measured)[None]
 
 
 class LinkFactor(Factor):
@@ -157,8 +156,12 @@ class LinkFactor(Factor):
     def data(self):
         return self.measured
 
+    @property
+    def widths(self):
+        return (6, 6, 6, 6)
+
     def local(self, own, data, ports):
-        poses = [pose_from_vector(own[6 * k : 6 * k + 6]) for k in range(4)]
+        poses = [pose_from_vector(vector) for vector in own]
         world_from_a, world_from_b = poses[0] @ poses[1], poses[2] @ poses[3]
         return se3_log(pose_from_vector(data).inverse() @ world_from_a.inverse() @ world_from_b)
 
@@ -174,8 +177,12 @@ class EdgeFactor(Factor):
     def data(self):
         return self.measured
 
+    @property
+    def widths(self):
+        return (6,)
+
     def local(self, own, data, ports):
-        return se3_log(pose_from_vector(data).inverse() @ pose_from_vector(own))
+        return se3_log(pose_from_vector(data).inverse() @ pose_from_vector(own[0]))
 
 
 class ClosureFactor(Factor):
@@ -192,12 +199,16 @@ class ClosureFactor(Factor):
     def data(self):
         return self.forward
 
+    @property
+    def widths(self):
+        return (6,) * (self.slots.shape[1] // 6)
+
     def local(self, own, data, ports):
         product = Pose.identity()
-        for k in range(self.slots.shape[1] // 6):
-            link = pose_from_vector(own[6 * k : 6 * k + 6])
+        for vector, sign in zip(own, data, strict=True):
+            link = pose_from_vector(vector)
             back = link.inverse()
-            ahead = data[k] > 0.0
+            ahead = sign > 0.0
             product = product @ Pose(
                 jnp.where(ahead, link.rotation, back.rotation),
                 jnp.where(ahead, link.shift, back.shift),
@@ -216,5 +227,9 @@ class PriorFactor(Factor):
     def data(self):
         return self.expected
 
+    @property
+    def widths(self):
+        return (1,)
+
     def local(self, own, data, ports):
-        return own - data
+        return own[0] - data

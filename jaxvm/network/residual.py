@@ -8,6 +8,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxvm.network.factors import (
@@ -117,14 +118,21 @@ def _course(factor, network, flat, values, slopes):
     )
 
 
-def _gather(factor, network, flat) -> Row:
+def parts_of(factor: Factor, flat: Float[Array, " n"]) -> tuple[Float[Array, "n part"], ...]:
+    """Values at the slots of a table, one array for each parameter."""
+    ends = np.cumsum(factor.widths)
+    pieces = zip(ends - np.array(factor.widths), ends, strict=True)
+    return tuple(flat[factor.slots[:, a:b]] for a, b in pieces)
+
+
+def _gather(factor: Factor, network: Network, flat) -> Row:
     n = factor.slots.shape[0]
 
     def repeat(name):
         values = flat[jnp.asarray(network.layout.all(name))]
         return jnp.broadcast_to(values, (n, values.shape[0]))
 
-    return Row(flat[factor.slots], repeat("amplitude"), repeat("constant"))
+    return Row(parts_of(factor, flat), repeat("amplitude"), repeat("constant"))
 
 
 def _local(factor, network, row: Row, course: Course | None, data, disturbance=None):
@@ -145,11 +153,15 @@ def block_jacobian(
     constants, so that the derivative stays local.
     """
     row = _gather(factor, network, flat)
-    stacked = jnp.concatenate(row, axis=1)
-    n_own, n_amplitude = factor.slots.shape[1], network.effects.n_columns
-    wanted = jnp.asarray(live)
+    values, structure = jax.tree.flatten(row)
+    ends = np.cumsum([value.shape[1] for value in values])
+    first = np.concatenate([[0], ends])[:-1]
+    # Only parameters with a wanted slot are differentiated; the others are constants.
+    moving = [k for k in range(len(values)) if any(first[k] <= at < ends[k] for at in live)]
+    within = np.concatenate([np.arange(first[k], ends[k]) for k in moving] or [[]])
+    wanted = jnp.asarray(np.searchsorted(within, np.asarray(live, int)), int)
     course = None
-    if isinstance(factor, PixelFactor | RangeFactor) and n_amplitude:
+    if isinstance(factor, PixelFactor | RangeFactor) and network.effects.n_columns:
         constant = flat[jnp.asarray(network.layout.all("constant"))]
 
         def of_constants(c):
@@ -160,11 +172,14 @@ def block_jacobian(
         )
 
     def local(free, everything, at, data):
-        full = everything.at[wanted].set(free)
-        split = Row(full[:n_own], full[n_own : n_own + n_amplitude], full[n_own + n_amplitude :])
-        return _local(factor, network, split, at, data)
+        full = list(everything)
+        for k, value in zip(moving, free, strict=True):
+            full[k] = value
+        return _local(factor, network, jax.tree.unflatten(structure, full), at, data)
 
-    return jax.vmap(jax.jacrev(local))(stacked[:, wanted], stacked, course, factor.data())
+    free = [values[k] for k in moving]
+    blocks = jax.vmap(jax.jacrev(local))(free, values, course, factor.data())
+    return jnp.concatenate(blocks, axis=2)[:, :, wanted]
 
 
 def port_jacobian(

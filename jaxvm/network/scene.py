@@ -7,6 +7,7 @@ that every result can say of which camera, target and epoch it speaks.
 from dataclasses import dataclass, replace
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -20,13 +21,14 @@ from jaxvm.network.factors import (
     RangeFactor,
     rounded,
 )
-from jaxvm.network.residual import Network
+from jaxvm.network.residual import Network, parts_of
 from jaxvm.network.state import N_DISTORTION, Layout, State
 from jaxvm.network.unknowns import Unknowns, arrange, local_groups
-from jaxvm.physics.chain import Circumstances
+from jaxvm.physics.chain import Circumstances, Sight
 from jaxvm.physics.drivers import all_observation_drivers, build_channels, pattern
 from jaxvm.physics.effects import Effect, Scope, capacity, tabulate
 from jaxvm.physics.forms import FORMS
+from jaxvm.physics.ports import PortValues
 from jaxvm.recording import Recording
 
 
@@ -133,7 +135,7 @@ def build(recording: Recording, effects: tuple[Effect, ...] = ()) -> Scene:
         (),
         network,
         state,
-        Unknowns(nothing, nothing, 0, 0, 0, (), nothing),
+        Unknowns(nothing, nothing, 0, 0, 0, (), nothing, nothing),
         tables,
         station_row,
         target_row,
@@ -249,13 +251,13 @@ class _Index:
             slots = [
                 self.layout.slots("focal", camera),
                 self.layout.slots("centre", camera),
+                self.layout.slots("distortion", camera, family.n_coefficients),
                 self.layout.slots("station_from_camera", camera),
                 self.layout.slots(
                     "world_from_station", self.station_row[self.station_of[camera], epoch]
                 ),
                 self.layout.slots("world_from_target", self.target_row[target, epoch]),
                 self.layout.slots("point", point),
-                self.layout.slots("distortion", camera, family.n_coefficients),
             ]
             height = np.array([c.image_size[1] for c in self.model.cameras], float)[camera]
             sigma = np.repeat(obs.sigma[chosen][:, None], 2, axis=1)
@@ -495,12 +497,13 @@ def _unknowns(scene: Scene) -> Unknowns:
             release(slots, [f"rangefinder {finder.name}: {p}" for p in pose_parts])
     links = layout.all("link")
     release(links, [f"link {k // 6}: {pose_parts[k % 6]}" for k in range(len(links))])
-    idle = _release_effects(scene, layout, release)
+    idle = _release_effects(scene, layout, release, factor)
     group = local_groups(layout, {"epochs": by_epoch, "points": by_point}, free)
-    return arrange(free, group, tie, factor, tuple(label), idle)
+    momentary = np.flatnonzero(free & (by_epoch >= 0))
+    return arrange(free, group, tie, factor, tuple(label), idle, momentary)
 
 
-def _release_effects(scene: Scene, layout: Layout, release) -> np.ndarray:
+def _release_effects(scene: Scene, layout: Layout, release, factor) -> np.ndarray:
     """Give every column and constant an unknown; returns the positions that stay idle.
 
     Spare columns and constants that can't be refined have an unknown too, so that the sizes of a
@@ -523,6 +526,8 @@ def _release_effects(scene: Scene, layout: Layout, release) -> np.ndarray:
         refined = [first + k for k in range(m) if form.constants[k].refined]
         busy[constant[refined]] = True
         column, first = column + n, first + m
+    # The unknown of a constant is its relative change.
+    factor[constant] = np.asarray(scene.state.constant)[:-1]
     slots = np.concatenate([amplitude, constant])
     return slots[~busy[slots]]
 
@@ -579,22 +584,19 @@ def _bind(scene: Scene) -> Scene:
 
 def observation_driver_table(scene: Scene, factor: PixelFactor, rows: np.ndarray):
     """Observation-like drivers of a pixel table at the scene's present state."""
-    flat = scene.state.flatten()
     sizes = np.array([c.image_size for c in scene.model.cameras], float)
     padded = np.append(rows, np.full(factor.slots.shape[0] - len(rows), rows[-1]))
     size = jnp.asarray(sizes[scene.recording.observations.camera[padded]])
-    return _driver_table(factor, flat, size, jnp.asarray(scene.model.up, float))
+    up = jnp.asarray(scene.model.up, float)
+    return _driver_table(factor, scene.state.flatten(), size, up)
 
 
 @eqx.filter_jit
-def _driver_table(factor, flat, size, up):
-    sights = jax_vmap_sight(factor, flat)
-    return all_observation_drivers(sights, factor.circumstances, size, up)
-
-
-def jax_vmap_sight(factor: PixelFactor, flat):
-    """Parameters of all observations of a table."""
-    return eqx.filter_vmap(factor.sight)(flat[factor.slots])
+def _driver_table(factor: PixelFactor, flat, size, up):
+    own = parts_of(factor, flat)
+    plain = jax.vmap(lambda o, at: factor.local(o, at, PortValues()) + at.pixel)
+    predicted = plain(own, factor.circumstances)
+    return all_observation_drivers(Sight(*own), factor.circumstances, predicted, size, up)
 
 
 def in_scope(scene: Scene, scope: Scope, rows: np.ndarray) -> np.ndarray:

@@ -26,6 +26,7 @@ class Unknowns:
         group_size: unknowns in a local group; smaller groups are filled up.
         label: name of each position of the flat state.
         idle: positions that have an unknown but don't move (spare room for effects).
+        momentary: positions of poses that belong to one epoch only.
     """
 
     column: Int[np.ndarray, " parameters"]
@@ -35,6 +36,7 @@ class Unknowns:
     group_size: int
     label: tuple[str, ...]
     idle: Int[np.ndarray, " idle"]
+    momentary: Int[np.ndarray, " momentary"]
 
     @property
     def n(self) -> int:
@@ -47,6 +49,13 @@ class Unknowns:
         mask = np.zeros(self.n + 1, bool)
         mask[self.column] = True
         mask[self.column[self.idle]] = False
+        return mask[:-1]
+
+    @property
+    def of_one_epoch(self) -> np.ndarray:
+        """True for the entries of x that one epoch alone determines (poses per epoch)."""
+        mask = np.zeros(self.n + 1, bool)
+        mask[self.column[self.momentary]] = True
         return mask[:-1]
 
     def names(self) -> list[str]:
@@ -64,6 +73,7 @@ def arrange(
     factor: Float[np.ndarray, " parameters"],
     label: tuple[str, ...],
     idle: Int[np.ndarray, " idle"],
+    momentary: Int[np.ndarray, " momentary"],
 ) -> Unknowns:
     """Order the free parameters.
 
@@ -74,6 +84,7 @@ def arrange(
         factor: change of the parameter for a unit change of its unknown.
         label: names.
         idle: positions that are free in form only.
+        momentary: positions of poses of one epoch.
     """
     leads = free & (tie == np.arange(len(free)))
     shared = np.flatnonzero(leads & (group < 0))
@@ -90,7 +101,7 @@ def arrange(
     column[shared] = np.arange(len(shared))
     column[local] = len(shared) + member_of * size + rank
     column = np.where(free, column[tie], n)
-    return Unknowns(column, factor, len(shared), len(groups), size, label, idle)
+    return Unknowns(column, factor, len(shared), len(groups), size, label, idle, momentary)
 
 
 def local_groups(layout: Layout, candidates: dict[str, np.ndarray], free: np.ndarray) -> np.ndarray:

@@ -114,12 +114,6 @@ CATALOGUE: tuple[Entry, ...] = (
         "at all times.",
     ),
     Entry(
-        "mark-moved", "a mark was moved",
-        (_terms("target.point_x", "target.point_y"),), ("time",), ("step",), "mark",
-        (1e-5, 1e-2), "detection bias", "look with another camera",
-        "One mark changed its place at one moment. Before and after it keeps still.",
-    ),
-    Entry(
         "target-moved", "the target was knocked out of place",
         (*_axes("structure.shift"), *_axes("structure.turn")), ("time",), ("step",), "target",
         (1e-5, 5e-2), "the station moved", "watch further reference targets",

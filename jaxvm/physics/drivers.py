@@ -1,9 +1,10 @@
 """Drivers: what an effect depends on.
 
 Time-like drivers are channels (recorded quantities, time, time since power-on). Observation-like
-drivers are computed for each observation from the measured pixel and the present geometry; they are
-circumstances, not unknowns, and are held while a model is fitted: their noise enters an effect only
-in second order.
+drivers are computed for each observation from the present model; they are circumstances, not
+unknowns, and are held while a model is fitted. The place in the image is the *predicted* one: the
+measured one contains the residual, and a pattern made of residuals explains everything. Only the
+phase within a pixel is taken from the measurement, because a prediction is not that good.
 """
 
 from collections.abc import Callable
@@ -48,6 +49,7 @@ OBSERVATION_DRIVER_INDEX = {name: i for i, name in enumerate(OBSERVATION_DRIVERS
 def observation_drivers(
     sight: Sight,
     circumstances: Circumstances,
+    predicted: Float[Array, "2"],
     image_size: Float[Array, "2"],
     up: Float[Array, "3"],
 ) -> Float[Array, " drivers"]:
@@ -77,8 +79,8 @@ def observation_drivers(
     motion = sight.focal * (speed[:2] - ray[:2] / ray[2] * speed[2]) / mark_cam[2]
 
     half_diagonal = 0.5 * jnp.linalg.norm(image_size)
-    from_centre = (at.pixel - sight.centre) / half_diagonal
-    in_image = (at.pixel + 0.5) / image_size - 0.5
+    from_centre = (predicted - sight.centre) / half_diagonal
+    in_image = (predicted + 0.5) / image_size - 0.5
     in_target = (sight.point - at.target_centre)[:2] / at.target_half_size
     return jnp.stack(
         [
@@ -144,5 +146,5 @@ def build_channels(
     )
 
 
-all_observation_drivers = jax.vmap(observation_drivers, in_axes=(0, 0, 0, None))
+all_observation_drivers = jax.vmap(observation_drivers, in_axes=(0, 0, 0, 0, None))
 """`observation_drivers` of a table of observations."""

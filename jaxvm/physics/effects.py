@@ -190,7 +190,7 @@ def capacity(effects: tuple[Effect, ...]) -> tuple[int, int]:
     constants = sum(len(e.constants) for e in effects)
     if columns == 0:
         return 0, 1
-    return 8 * -(-columns // 8), 4 * -(-(constants + 1) // 4)
+    return 4 * -(-columns // 4), 4 * -(-(constants + 1) // 4)
 
 
 def courses(

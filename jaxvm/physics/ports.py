@@ -6,6 +6,8 @@ hypothesis or a temperature model does to a prediction, it does through a port.
 
 from dataclasses import dataclass
 
+import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 STAGES = (
@@ -90,25 +92,21 @@ N_PORTS = len(PORTS)
 
 
 class PortValues:
-    """Read a vector of port values by name; without a vector every port is exactly zero."""
+    """Read a vector of port values by name; without a vector every port is exactly zero.
+
+    The vector is split once, by one operation whose transpose is one concatenation; slicing it port
+    by port would cost a padded sum for each in reverse mode.
+    """
 
     def __init__(self, values: Float[Array, " ports"] | None = None):
-        self._values = values
+        self.plain = values is None
+        if values is not None:
+            self._values = [part[0] for part in jax.lax.split(values, (1,) * N_PORTS)]
 
     def __getitem__(self, name: str) -> Float[Array, ""] | float:
         """Value of one port, in its unit."""
-        if self._values is None:
-            return 0.0
-        return self._values[PORT_INDEX[name]]
+        return 0.0 if self.plain else self._values[PORT_INDEX[name]]
 
-    def axes(self, prefix: str) -> Float[Array, "3"] | None:
-        """The three components `prefix_x, prefix_y, prefix_z`; None in the plain model."""
-        if self._values is None:
-            return None
-        start = PORT_INDEX[f"{prefix}_x"]
-        return self._values[start : start + 3]
-
-    @property
-    def plain(self) -> bool:
-        """True where nothing perturbs the chain."""
-        return self._values is None
+    def axes(self, prefix: str) -> Float[Array, "3"]:
+        """The three components `prefix_x, prefix_y, prefix_z`."""
+        return jnp.stack([jnp.asarray(self[f"{prefix}_{axis}"]) for axis in "xyz"])

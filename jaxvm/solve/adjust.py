@@ -87,7 +87,9 @@ def adjust(
     method: str = "levenberg-marquardt",
     loss: Loss | None = None,
     weights: tuple[np.ndarray, ...] | None = None,
+    range_weights: np.ndarray | None = None,
     active: np.ndarray | None = None,
+    rtol: float = 1e-12,
     max_steps: int = 100,
     check: bool = True,
 ) -> Adjustment:
@@ -98,7 +100,9 @@ def adjust(
         method: "levenberg-marquardt" or "gauss-newton".
         loss: robust loss; least squares by default.
         weights: weight of every observation of every pixel table (0 sets it aside).
+        range_weights: the same for the ranges.
         active: unknowns that may move; all by default.
+        rtol: relative change of the cost at which it stops.
         max_steps: bound on evaluations.
         check: look for rank deficiency first.
 
@@ -112,12 +116,16 @@ def adjust(
     problem = scene_problem(scene, loss)
     if weights is not None:
         problem = with_weights(problem, weights)
+    if range_weights is not None:
+        problem = eqx.tree_at(
+            lambda p: p.network.ranges.weight, problem, jnp.asarray(range_weights)
+        )
     if active is not None:
         problem = eqx.tree_at(lambda p: p.active, problem, problem.active & jnp.asarray(active))
     problem, normal = scaled(problem, normal_at_start(problem))
     if check:
         check_gauge(normal, scene.unknowns)
-    solution = _minimise(problem, METHODS[method](), max_steps)
+    solution = _minimise(problem, METHODS[method](jnp.asarray(rtol)), max_steps)
     x = solution.value
     stats = solution.stats
     history = np.asarray(stats["history"])

@@ -50,14 +50,14 @@ class Relaxing(optx.ClassicalTrustRegion):
 class NormalEquationSolver(optx.AbstractLeastSquaresSolver):
     """Least squares by normal equations: a descent, a search, and a statistical stopping rule.
 
-    The problem is passed as `args`. It stops when a hardly damped step changes the cost by less
-    than `rtol` of itself plus `atol`, or when damping can't find a lower cost any more. The cost is
+    The problem is passed as `args`. It stops when a hardly damped step changes the cost by no
+    more than `rtol` of itself plus `atol`, up or down, or when damping can't find a lower cost any more. The cost is
     half a chi-square, so a change of `atol` moves no combination of unknowns by more than
     sqrt(2 atol) of its standard deviation.
     """
 
-    rtol: float
-    atol: float
+    rtol: float | Float[Array, ""]
+    atol: float | Float[Array, ""]
     norm: Any
     descent: optx.AbstractDescent
     search: optx.AbstractSearch
@@ -91,7 +91,7 @@ class NormalEquationSolver(optx.AbstractLeastSquaresSolver):
         gained = state.info.f - info.f
         settled = (jnp.abs(gained) <= self.rtol * info.f + self.atol) & (size >= 1.0)
         stuck = ~accept & (size < 1e-12)
-        done = ~state.first & ((accept & settled) | stuck)
+        done = ~state.first & (settled | stuck)
 
         def choose(new, old):
             return jax.tree.map(lambda a, b: jnp.where(accept, a, b), new, old)
@@ -129,7 +129,7 @@ class NormalEquationSolver(optx.AbstractLeastSquaresSolver):
         }  # fmt: skip
 
 
-def gauss_newton(rtol: float = 1e-12, atol: float = 1e-9) -> NormalEquationSolver:
+def gauss_newton(rtol=1e-12, atol: float = 1e-9) -> NormalEquationSolver:
     """Full Gauss-Newton steps: fastest near the solution, may diverge far from it."""
     return NormalEquationSolver(
         rtol, atol, optx.max_norm, optx.NewtonDescent(linear_solver=ArrowCholesky()),
@@ -137,7 +137,7 @@ def gauss_newton(rtol: float = 1e-12, atol: float = 1e-9) -> NormalEquationSolve
     )  # fmt: skip
 
 
-def levenberg_marquardt(rtol: float = 1e-12, atol: float = 1e-9) -> NormalEquationSolver:
+def levenberg_marquardt(rtol=1e-12, atol: float = 1e-9) -> NormalEquationSolver:
     """Damped steps with a trust region: the default."""
     return NormalEquationSolver(
         rtol, atol, optx.max_norm, optx.DampedNewtonDescent(linear_solver=ArrowCholesky()),

@@ -7,16 +7,15 @@ For the two components of an image point the test is on both: T = v^T (R)^-1 v ~
 from dataclasses import dataclass
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 from scipy.stats import chi2
 
 from jaxvm.network.scene import Scene
 from jaxvm.solve.adjust import Adjustment, adjust
-from jaxvm.solve.arrow import ArrowFactors, factorise
-from jaxvm.solve.problem import Packets, Problem, split_columns
+from jaxvm.solve.arrow import factorise
+from jaxvm.solve.problem import Problem
+from jaxvm.solve.reduced import half_rows
 
 
 @dataclass(frozen=True)
@@ -49,49 +48,6 @@ def _redundancies(problem: Problem, x):
         hat = jnp.einsum("nak,nbk->nab", half, half)
         result.append(jnp.eye(hat.shape[1]) - hat)
     return result
-
-
-def half_rows(
-    factors: ArrowFactors,
-    packets: Packets,
-    jacobian: Float[Array, "obs comps live"],
-    sizes: tuple[int, int, int],
-) -> Float[Array, "obs comps d_plus_s"]:
-    """Rows of J L^-T with H = L L^T: their inner products are those of J H^-1 J^T.
-
-    Only the group of the observation and the shared unknowns are non-zero, so d + s columns do.
-    """
-    s, groups, d = sizes
-    place, group, member = split_columns(packets.columns, sizes)
-    n = jacobian.shape[0]
-    packet_of = (
-        jnp.zeros(n + 1, int)
-        .at[packets.rows]
-        .set(jnp.broadcast_to(jnp.arange(packets.rows.shape[0])[:, None], packets.rows.shape))
-    )[:n]
-    shared = _spread(jacobian, place[packet_of], s)
-    if not groups:
-        return jax.scipy.linalg.solve_triangular(
-            factors.reduced, shared.reshape(-1, s).T, lower=True
-        ).T.reshape(shared.shape)
-    local = _spread(jacobian, member[packet_of], d)
-    own = jnp.minimum(group[packet_of], groups - 1)
-    local = jnp.where((group[packet_of] < groups)[:, None, None], local, 0.0)
-    solved = jax.vmap(
-        lambda f, rows: jax.scipy.linalg.solve_triangular(f, rows.T, lower=True).T
-    )(factors.local[own], local)
-    rest = shared - jnp.einsum("nad,nds->nas", solved, factors.coupled[own])
-    reduced = jax.scipy.linalg.solve_triangular(factors.reduced, rest.reshape(-1, s).T, lower=True)
-    return jnp.concatenate([solved, reduced.T.reshape(rest.shape)], axis=2)
-
-
-def _spread(jacobian, places, width):
-    """Live slots added into dense columns; the column `width` collects what does not belong."""
-    n, components, _ = jacobian.shape
-    dense = jnp.zeros((n, width + 1, components))
-    rows = jnp.arange(n)[:, None]
-    dense = dense.at[rows, places].add(jnp.swapaxes(jacobian, 1, 2))
-    return jnp.swapaxes(dense[:, :width], 1, 2)
 
 
 def snoop(

@@ -1,0 +1,422 @@
+"""From mismatch to physics: the whole road, from a recording to named and proven findings.
+
+Compare, score, test, model, weigh the doubles, prove on held-out epochs, and go on until nothing
+significant is left. No finding is claimed that does not pass on epochs which were never fitted.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from jaxvm.discover.heldout import (
+    Gain,
+    HeldOut,
+    evaluate,
+    gain,
+    hold_out,
+    range_weights_of,
+    weights_of,
+)
+from jaxvm.discover.hypotheses import Hypothesis, enumerate_hypotheses
+from jaxvm.discover.locate import Place, ResidualTable, locate, residual_table
+from jaxvm.discover.score import Ranking, score
+from jaxvm.discover.select import Candidate, Rival, refit, rivals, shortlist
+from jaxvm.network.scene import Scene, build
+from jaxvm.network.start import start
+from jaxvm.physics.effects import Effect, capacity
+from jaxvm.recording import Recording
+from jaxvm.solve.adjust import Adjustment, adjust, reference_sigma
+from jaxvm.solve.covariance import standard_deviations
+from jaxvm.solve.snooping import robust_variance
+
+ALPHA = 0.01
+"""Family-wise probability to claim something where nothing is hidden."""
+
+GROSS = 12.0
+"""Residuals beyond this many robust standard deviations are mistakes, not physics."""
+
+_ROOM = (12, 4)
+_CANDIDATES = 4
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One proven effect.
+
+    Attributes:
+        hypothesis: what it is.
+        effect: with amplitudes and constants from all epochs.
+        stds: standard deviations of the amplitudes, then of the constants.
+        weight: posterior weight among its doubles.
+        rivals: hypotheses that this recording can't tell from it.
+        p_value: family-wise.
+        n_hypotheses: how many were tried.
+        drop: of chi-square in the fitted epochs, in units of the noise.
+        gain: on held-out epochs.
+        ranking: leading hypotheses at the time, as (words, evidence).
+    """
+
+    hypothesis: Hypothesis
+    effect: Effect
+    stds: tuple[float, ...]
+    weight: float
+    rivals: tuple[Rival, ...]
+    p_value: float
+    n_hypotheses: int
+    drop: float
+    gain: Gain
+    ranking: tuple[tuple[str, float], ...]
+
+
+@dataclass(frozen=True)
+class Quality:
+    """How well a model fits: weighted RMS (px) fitted and held out, chi-square per freedom."""
+
+    rms_px: float
+    heldout_rms_px: float
+    chi2_per_dof: float
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Everything that a report says.
+
+    Attributes:
+        recording: what was diagnosed.
+        verdict: "consistent", "explained", "partly explained" or "unexplained".
+        noise_px: robust standard deviation of one pixel coordinate after the last fit.
+        plain, final: quality of the first and the last model.
+        findings: in the order in which they were found.
+        significant_left: whether something significant is left over.
+        left_p_value: its family-wise p-value.
+        located_before, located_left: where residuals are large, before and after.
+        before, after: residual tables of the plain and the last model (all epochs).
+        held: epochs that were set aside.
+        heldout_before, heldout_after: squares by held-out epoch.
+        scene: the last model, fitted to all epochs.
+        n_rejected: gross errors set aside.
+        n_hypotheses: hypotheses in the last round.
+        unproven: the leading name for what is left, where it did not pass on held-out epochs.
+        smallest: smallest amplitude that the recording could show, by catalogue entry.
+        seconds: wall time.
+    """
+
+    recording: Recording
+    verdict: str
+    noise_px: float
+    plain: Quality
+    final: Quality
+    findings: tuple[Finding, ...]
+    significant_left: bool
+    left_p_value: float
+    located_before: tuple[Place, ...]
+    located_left: tuple[Place, ...]
+    before: ResidualTable
+    after: ResidualTable
+    held: np.ndarray
+    heldout_before: HeldOut
+    heldout_after: HeldOut
+    scene: Scene
+    n_rejected: int
+    n_hypotheses: int
+    unproven: str
+    smallest: dict[str, tuple[float, str]] = field(default_factory=dict)
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Fits:
+    """Data split and what was fitted so far."""
+
+    held: np.ndarray
+    sound: tuple[np.ndarray, ...]
+    weights: tuple[np.ndarray, ...]
+    range_weights: np.ndarray | None
+
+
+def diagnose(
+    recording: Recording,
+    effects: tuple[Effect, ...] = (),
+    every: int = 3,
+    alpha: float = ALPHA,
+    max_findings: int = 8,
+    seed: int = 0,
+    progress: Callable[[str], None] = lambda line: None,
+) -> Diagnosis:
+    """Find the physics that a recording shows and its model lacks.
+
+    Args:
+        recording: measurements and the engineer's model.
+        effects: physics already in the model.
+        every: every n-th epoch is held out.
+        alpha: family-wise probability of a false claim.
+        max_findings: bound on the number of findings.
+        seed: of sign-flips and bootstrap.
+        progress: called with a line for each stage.
+
+    Raises:
+        StartError: the data give no start values.
+        RankDeficiency: the model has unknowns that the recording does not determine.
+    """
+    began = time.perf_counter()
+    progress("start values from the data")
+    scene = start(build(recording))
+    scene = scene.with_effects(effects, _room(effects))
+    held = hold_out(scene, every)
+    everything = tuple(np.ones(len(rows)) for rows in scene.tables)
+    progress("fit of the plain model")
+    split = _split(scene, held, everything)
+    base = _fit(scene, split, check=True)
+    sound = _sound(base, scene, held, everything)
+    n_rejected = int(sum(np.sum(good == 0) for good in sound))
+    split = _split(scene, held, sound)
+    if n_rejected:
+        base = _fit(base.scene, split)
+    plain_heldout = evaluate(base.scene, held, sound)
+    plain = base
+    n = sum(int(w.sum()) * 2 for w in split.weights)
+
+    current, best_heldout = base, plain_heldout
+    findings: list[Finding] = []
+    candidates: list[Candidate] = []
+    unproven, p_value, ranking = "", 1.0, None
+    while True:
+        progress(f"scoring hypotheses (round {len(findings) + 1})")
+        families = enumerate_hypotheses(current.scene)
+        variance = robust_variance(current)
+        ranking, arrangement = score(current, families, variance, seed=seed)
+        p_value = ranking.p_value(ranking.best_z())
+        if p_value > alpha or len(findings) == max_findings:
+            break
+        progress(f"{ranking.n} hypotheses, p = {p_value:.3g}: refitting the leading ones")
+        leading = shortlist(ranking, current.scene, variance, n, 12)
+        accepted = _accept(current, leading, split, n, best_heldout, held, sound, seed)
+        if isinstance(accepted, str):
+            unproven = accepted
+            break
+        chosen, heldout, proof = accepted
+        weight, doubles = rivals(current.scene, arrangement, ranking, chosen, current, n)
+        drop = 2.0 * (current.cost - chosen.adjustment.cost) / chosen.adjustment.variance_factor
+        findings.append(
+            Finding(
+                hypothesis=chosen.hypothesis,
+                effect=chosen.effect,
+                stds=(),
+                weight=weight,
+                rivals=tuple(doubles[:8]),
+                p_value=p_value,
+                n_hypotheses=ranking.n,
+                drop=drop,
+                gain=proof,
+                ranking=tuple((_short(h), e) for h, e, _ in leading),
+            )
+        )
+        candidates.append(chosen)
+        progress(f"found: {chosen.effect.name} ({chosen.effect.scope.words()})")
+        current, best_heldout = chosen.adjustment, heldout
+        current, findings = _prune(current, findings, split, n)
+
+    progress("final fit to all epochs")
+    whole = tuple(sound)
+    final = _fit(current.scene, _Fits(held, sound, whole, None))
+    findings = _with_final_values(final, findings, len(effects))
+    before = _table(plain, plain_heldout, scene, sound)
+    after = _table(final, None, scene, sound)
+    noise = np.sqrt(robust_variance(final)) * reference_sigma(scene)
+    significant = p_value <= alpha
+    return Diagnosis(
+        recording=recording,
+        verdict=_verdict(findings, significant),
+        noise_px=float(noise),
+        plain=_quality(plain, plain_heldout),
+        final=_quality(current, best_heldout),
+        findings=tuple(findings),
+        significant_left=significant,
+        left_p_value=p_value,
+        located_before=tuple(locate(scene, before)[:8]),
+        located_left=tuple(locate(final.scene, after)[:8]),
+        before=before,
+        after=after,
+        held=held,
+        heldout_before=plain_heldout,
+        heldout_after=best_heldout,
+        scene=final.scene,
+        n_rejected=n_rejected,
+        n_hypotheses=ranking.n,
+        unproven=unproven,
+        smallest=_smallest(ranking, robust_variance(current), current.scene),
+        seconds=time.perf_counter() - began,
+    )
+
+
+def _room(effects: tuple[Effect, ...]) -> tuple[int, int]:
+    columns, constants = capacity(effects)
+    return columns + _ROOM[0], max(constants, 1) - 1 + _ROOM[1]
+
+
+def _split(scene: Scene, held: np.ndarray, sound) -> _Fits:
+    return _Fits(
+        held, sound, weights_of(scene, ~held, sound), range_weights_of(scene, ~held)
+    )
+
+
+def _fit(scene: Scene, split: _Fits, check: bool = False) -> Adjustment:
+    return adjust(
+        scene, weights=split.weights, range_weights=split.range_weights, check=check
+    )
+
+
+def _sound(base: Adjustment, scene: Scene, held, everything) -> tuple[np.ndarray, ...]:
+    """Observations without gross errors, by the plain model, in fitted and held-out epochs."""
+    limit = GROSS * np.sqrt(robust_variance(base))
+    inside = base.residuals()
+    momentary = adjust(
+        base.scene,
+        weights=weights_of(scene, held, everything),
+        range_weights=range_weights_of(scene, held),
+        active=scene.unknowns.of_one_epoch,
+        check=False,
+    ).residuals()
+    return tuple(
+        (
+            (np.abs(np.asarray(a)).max(axis=1) <= limit)
+            & (np.abs(np.asarray(b)).max(axis=1) <= limit)
+        ).astype(float)
+        for a, b in zip(inside.pixels, momentary.pixels, strict=True)
+    )
+
+
+def _accept(current, leading, split: _Fits, n: int, heldout: HeldOut, held, sound, seed):
+    """The best candidate that improves the held-out epochs, or the name of the one that failed."""
+    room = (
+        current.scene.network.effects.n_columns,
+        current.scene.state.constant.shape[0],
+    )
+    refitted = []
+    for hypothesis, _, amplitudes in leading[:_CANDIDATES]:
+        candidate = refit(
+            current, hypothesis, amplitudes, room, split.weights, split.range_weights, n
+        )
+        if candidate is not None:
+            refitted.append(candidate)
+    refitted = sorted(refitted, key=lambda c: -_common_evidence(c, refitted, current, n))
+    for candidate in refitted[:2]:
+        tried = evaluate(candidate.adjustment.scene, held, sound)
+        proof = gain(heldout, tried, seed)
+        if proof.proven:
+            return candidate, tried, proof
+    return _short(refitted[0].hypothesis if refitted else leading[0][0])
+
+
+def _common_evidence(candidate: Candidate, all_candidates, current: Adjustment, n: int) -> float:
+    """Evidence with one variance for all candidates: the smallest that any of them reaches."""
+    variance = min(c.adjustment.variance_factor for c in all_candidates)
+    own = candidate.adjustment.variance_factor
+    drop = 2.0 * (current.cost - candidate.adjustment.cost)
+    return candidate.evidence + drop * (1.0 / variance - 1.0 / own)
+
+
+def _prune(current: Adjustment, findings: list[Finding], split: _Fits, n: int):
+    """Drop earlier findings that the later ones made superfluous (Wald test against BIC)."""
+    given = len(current.scene.effects) - len(findings)
+    variance = current.variance_factor
+    for k in range(len(findings) - 1):
+        kept = [e for i, e in enumerate(current.scene.fitted_effects()) if i != given + k]
+        room = (current.scene.network.effects.n_columns, current.scene.state.constant.shape[0])
+        without = _fit(current.scene.with_effects(tuple(kept), room), split)
+        columns = len(findings[k].effect.amplitudes) + len(findings[k].effect.constants)
+        if 2.0 * (without.cost - current.cost) / variance < columns * np.log(n):
+            return without, findings[:k] + findings[k + 1 :]
+    return current, findings
+
+
+def _with_final_values(final: Adjustment, findings: list[Finding], given: int) -> list[Finding]:
+    """Findings with amplitudes, constants and deviations from the fit to all epochs."""
+    deviations = standard_deviations(final, robust_variance(final))
+    amplitude, constant = np.asarray(deviations.amplitude), np.asarray(deviations.constant)
+    fitted = final.scene.fitted_effects()
+    column = sum(e.n_columns for e in fitted[:given])
+    first = sum(len(e.constants) for e in fitted[:given])
+    result = []
+    for finding, effect in zip(findings, fitted[given:], strict=True):
+        n, m = effect.n_columns, len(effect.constants)
+        stds = (*amplitude[column : column + n], *constant[first : first + m])
+        result.append(
+            Finding(**{**vars(finding), "effect": effect, "stds": tuple(map(float, stds))})
+        )
+        column, first = column + n, first + m
+    return result
+
+
+def _table(fitted: Adjustment, heldout: HeldOut | None, scene: Scene, sound) -> ResidualTable:
+    """Residuals in all epochs. A fit to some epochs is completed by the poses of the others."""
+    reference = reference_sigma(scene)
+    if heldout is None:
+        return residual_table(scene, fitted.residuals().pixels, sound, reference)
+    completed = adjust(
+        fitted.scene,
+        weights=tuple(sound),
+        active=scene.unknowns.of_one_epoch,
+        check=False,
+    )
+    return residual_table(scene, completed.residuals().pixels, sound, reference)
+
+
+def _quality(fitted: Adjustment, heldout: HeldOut) -> Quality:
+    square = sum(float(np.sum(np.asarray(b) ** 2)) for b in fitted.residuals().pixels)
+    count = sum(2.0 * float(np.sum(np.asarray(f.weight) > 0))
+                for f in fitted.problem.network.pixels)  # fmt: skip
+    rms = np.sqrt(square / count) * reference_sigma(fitted.scene)
+    return Quality(float(rms), heldout.rms_px, fitted.variance_factor)
+
+
+def _verdict(findings: list[Finding], significant: bool) -> str:
+    if not findings:
+        return "unexplained" if significant else "consistent"
+    return "partly explained" if significant else "explained"
+
+
+def _short(hypothesis: Hypothesis) -> str:
+    effect = hypothesis.effect(())
+    parts = [effect.name]
+    if effect.driver != "constant":
+        parts.append(f"{effect.form} in {effect.driver}")
+    parts.append(effect.scope.words())
+    return " · ".join(parts)
+
+
+def _smallest(ranking: Ranking, variance: float, scene: Scene) -> dict[str, tuple[float, str]]:
+    """Smallest amplitude that would be found at family-wise 5 % with power 80 %, by entry.
+
+    sqrt(lambda0 / I) with I the information of one column (MATHEMATICS 1.8); lambda0 from the
+    number of hypotheses. Single-term constant hypotheses only; the most favourable place counts.
+    """
+    from jaxvm.discover.hypotheses import member
+    from jaxvm.physics.ports import PORTS
+    from scipy.stats import norm
+
+    level = norm.isf(0.025 / max(ranking.n, 1)) + norm.isf(0.2)
+    unit = {port.name: port.unit for port in PORTS}
+    smallest: dict[str, tuple[float, str]] = {}
+    for scores in ranking.scores:
+        if scores.amplitude.shape[-1] != 1:
+            continue
+        with np.errstate(divide="ignore", invalid="ignore"):
+            # One-step amplitude a = S / I and drop S^2 / I give the information drop / a^2.
+            information = scores.drop / scores.amplitude[..., 0] ** 2
+            detectable = level * np.sqrt(variance / information)
+        detectable = np.where(scores.valid & np.isfinite(detectable), detectable, np.inf)
+        for g in range(len(scores.family.groups)):
+            for c, course in enumerate(scores.family.courses):
+                s = int(np.argmin(detectable[g, c]))
+                if not np.isfinite(detectable[g, c, s]) or course.form not in ("constant", "linear"):
+                    continue
+                hypothesis = member(scores.family, (g, c, s), scene)
+                for entry in hypothesis.entries:
+                    key = f"{entry.id} ({course.driver})" if course.driver != "constant" else entry.id
+                    value = float(detectable[g, c, s])
+                    if key not in smallest or value < smallest[key][0]:
+                        smallest[key] = (value, unit[hypothesis.group.terms[0].port])
+    return smallest

@@ -1,0 +1,293 @@
+"""The space of hypotheses: port x driver x form x scope, enumerated for one recording.
+
+A *group* is what enters where (terms), a *course* how it runs in time (driver, form, constants), a
+*scope* who has it. Groups of one size with courses of one size make a *family*; every member of a
+family is scored by the same compiled kernel.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from jaxvm.network.scene import Scene
+from jaxvm.physics.catalogue import CATALOGUE, Entry, entries_for
+from jaxvm.physics.effects import Effect, Scope, Term
+from jaxvm.physics.forms import FORMS
+from jaxvm.physics.ports import PORTS
+
+_ENTITY_OF_STAGE = {
+    "target": "target",
+    "structure": "target",
+    "station": "station",
+    "medium": "camera",
+    "shutter": "camera",
+    "mount": "camera",
+    "lens": "camera",
+    "sensor": "camera",
+    "detection": "camera",
+    "range": "rangefinder",
+}
+_STAGE = {port.name: port.stage for port in PORTS}
+
+_PATTERNS: tuple[tuple[str, str, tuple[float, ...]], ...] = (
+    *((driver, basis, ()) for driver in ("row", "column") for basis in ("linear", "square")),
+    *(("radius", basis, ()) for basis in ("linear", "square", "fourth", "sixth")),
+    *((driver, "linear", ()) for driver in ("image_x", "image_y", "range", "inverse_range")),
+    *(("incidence", basis, ()) for basis in ("linear", "square")),
+    *((driver, "linear", ()) for driver in ("motion_u", "motion_v", "up_x", "up_y", "up_z")),
+    *((d, basis, ()) for d in ("target_x", "target_y") for basis in ("linear", "square", "cube")),
+    *(
+        (driver, basis, (period,))
+        for driver in ("pixel_u", "pixel_v")
+        for period in (1.0, 2.0)
+        for basis in ("sine", "cosine")
+    ),
+)
+_PATTERNED_PORTS = ("detect.u", "detect.v", "sensor.focal", "target.point_z")
+_RADIAL_KNOTS = np.linspace(0.0, 1.0, 7)
+
+
+@dataclass(frozen=True)
+class Group:
+    """Terms that share a scope, and the kind of entity that has them."""
+
+    terms: tuple[Term, ...]
+    entity: str
+    mark: tuple[int, int] | None = None
+    """(target, point) when a single mark is meant."""
+
+
+@dataclass(frozen=True)
+class Course:
+    """A time-like driver in a form with given constants."""
+
+    driver: str
+    form: str
+    constants: tuple[float, ...] = ()
+    reference: float = 0.0
+
+
+@dataclass(frozen=True)
+class Family:
+    """Groups with the same number of terms, courses with the same number of bases, all scopes.
+
+    Hypothesis (g, c, s) is valid where the scope is of the group's kind; `valid` has the shape
+    [groups, courses, scopes].
+    """
+
+    groups: tuple[Group, ...]
+    courses: tuple[Course, ...]
+    scopes: tuple[Scope, ...]
+    valid: np.ndarray
+
+    @property
+    def n_terms(self) -> int:
+        """Terms of each group."""
+        return len(self.groups[0].terms)
+
+    @property
+    def n_bases(self) -> int:
+        """Bases of each course."""
+        return len(FORMS[self.courses[0].form].bases)
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """One member of a family."""
+
+    group: Group
+    course: Course
+    scope: Scope
+    entries: tuple[Entry, ...]
+
+    def effect(self, amplitudes) -> Effect:
+        """The hypothesis as an effect with given amplitudes."""
+        entry = self.entries[0] if self.entries else None
+        return Effect(
+            name=entry.physics if entry else describe(self),
+            terms=self.group.terms,
+            driver=self.course.driver,
+            form=self.course.form,
+            constants=self.course.constants,
+            reference=self.course.reference,
+            scope=self.scope,
+            amplitudes=tuple(float(a) for a in amplitudes),
+            catalogue_id=entry.id if entry else "",
+        )
+
+
+def describe(hypothesis: Hypothesis) -> str:
+    """A hypothesis without a name, in words."""
+    meaning = {port.name: port.meaning for port in PORTS}
+    first = hypothesis.group.terms[0]
+    words = meaning[first.port]
+    if first.driver != "one":
+        words += f", varying with {first.driver.replace('_', ' ')}"
+    if hypothesis.course.form != "constant":
+        form = FORMS[hypothesis.course.form].words.format(driver=hypothesis.course.driver)
+        words += f", {form}"
+    return words
+
+
+def enumerate_hypotheses(scene: Scene) -> tuple[Family, ...]:
+    """All hypotheses that a recording can be asked about."""
+    scopes = _scopes(scene)
+    courses = _courses(scene)
+    single = [Group((Term(port.name),), _ENTITY_OF_STAGE[port.stage]) for port in PORTS]
+    patterned = [
+        Group((Term(port, driver, basis, constants),), "camera")
+        for port in _PATTERNED_PORTS
+        for driver, basis, constants in _PATTERNS
+    ]
+    named = {1: [], 2: [], 3: []}
+    for entry in CATALOGUE:
+        for terms in entry.groups:
+            group = Group(terms, entry.entity)
+            plain = len(terms) == 1 and terms[0].driver == "one"
+            if entry.entity != "mark" and not plain and group not in named[len(terms)]:
+                named[len(terms)].append(group)
+    radial = Group(
+        tuple(Term("sensor.focal", "radius", "bump", (float(c), 1 / 6)) for c in _RADIAL_KNOTS),
+        "camera",
+    )
+    by_bases = {n: [c for c in courses if len(FORMS[c.form].bases) == n] for n in (1, 2)}
+    constant = [Course("constant", "constant")]
+    once = [group for group in named[1] if group not in patterned]
+    candidates = [
+        (single, by_bases[1]),
+        (single, by_bases[2]),
+        (patterned + once, constant),
+        (named[2], by_bases[1]),
+        (named[2], by_bases[2]),
+        (named[3], by_bases[1]),
+        (_marks(scene), constant),
+        ([radial], constant),
+    ]
+    families = (_family(groups, own, scopes) for groups, own in candidates if groups and own)
+    return tuple(family for family in families if family.valid.any())
+
+
+def member(family: Family, index: tuple[int, int, int], scene: Scene) -> Hypothesis:
+    """The hypothesis at [group, course, scope] of a family, with the names it has."""
+    group, course, scope = (
+        family.groups[index[0]],
+        family.courses[index[1]],
+        family.scopes[index[2]],
+    )
+    if group.mark is not None:
+        target = scene.model.targets[group.mark[0]]
+        scope = Scope(target=(target.name,), point=(target.point_names[group.mark[1]],))
+        entries = tuple(entry for entry in CATALOGUE if entry.entity == "mark")
+        return Hypothesis(group, course, scope, entries)
+    kind = driver_kind(scene, course.driver)
+    return Hypothesis(group, course, scope, entries_for(group.terms, kind, course.form))
+
+
+def driver_kind(scene: Scene, driver: str) -> str:
+    """Kind of a time-like driver: "constant", "quantity", "time" or "power-on"."""
+    channels = scene.network.channels
+    return channels.kinds[channels.index(driver)]
+
+
+def _family(groups, courses, scopes) -> Family:
+    kinds = [_kind(scope) for scope in scopes]
+    valid = np.zeros((len(groups), len(courses), len(scopes)), bool)
+    for g, group in enumerate(groups):
+        for c, course in enumerate(courses):
+            for s, scope in enumerate(scopes):
+                if group.mark is not None:
+                    valid[g, c, s] = s == 0
+                    continue
+                valid[g, c, s] = kinds[s] == group.entity or (
+                    # Air belongs to all cameras of a station alike.
+                    kinds[s] == "station" and _STAGE[group.terms[0].port] == "medium"
+                )
+                if course.driver.startswith("time since power-on of "):
+                    camera = course.driver.removeprefix("time since power-on of ")
+                    valid[g, c, s] &= scope.camera == (camera,)
+    return Family(tuple(groups), tuple(courses), tuple(scopes), valid)
+
+
+def _kind(scope: Scope) -> str:
+    return next(iter(scope.as_dict()), "all")
+
+
+def _scopes(scene: Scene) -> list[Scope]:
+    """Single entities and, where there are several, all of a kind together; the first is all."""
+    model, scopes = scene.model, [Scope()]
+    for kind, bodies in (
+        ("camera", model.cameras),
+        ("target", model.targets),
+        ("station", model.stations),
+        ("rangefinder", model.rangefinders),
+    ):
+        names = tuple(body.name for body in bodies)
+        scopes += [Scope(**{kind: (name,)}) for name in names]
+        if len(names) > 1:
+            scopes.append(Scope(**{kind: names}))
+    return scopes
+
+
+def _courses(scene: Scene) -> list[Course]:
+    channels = scene.network.channels
+    time = np.asarray(channels.epoch_time)
+    courses = [Course("constant", "constant")]
+    if len(time) < 6:
+        return courses
+    span = float(time[-1] - time[0])
+    spacing = float(np.median(np.diff(time)))
+    lags = np.geomspace(max(2 * spacing, span / 200), span / 3, 6)
+    for name, kind in zip(channels.names, channels.kinds, strict=True):
+        reference = channels.mean(name)
+        if kind == "quantity":
+            at_epochs = np.interp(time, channels.time, channels.values[channels.index(name)])
+            width = float(np.ptp(at_epochs))
+            if width == 0.0:
+                continue
+            rates = np.abs(np.gradient(at_epochs, time / 3600.0))
+            courses += [
+                Course(name, "linear", (), reference),
+                Course(name, "quadratic", (), reference),
+                *(Course(name, "lag", (float(tau),), reference) for tau in lags),
+                Course(name, "two lags", (float(lags[1]), float(lags[4])), reference),
+                Course(name, "rate"),
+                Course(name, "direction", (float(np.median(rates)) + 1e-12,)),
+                *(
+                    Course(name, "hysteresis", (float(share * width),), reference)
+                    for share in (0.1, 0.2, 0.3)
+                ),
+            ]
+        elif kind in ("time", "power-on"):
+            since = time - time[0] if kind == "time" else np.interp(
+                time, channels.time, channels.values[channels.index(name)]
+            )  # fmt: skip
+            courses += [Course(name, "onset", (float(tau),)) for tau in lags]
+            courses += [Course(name, "creep", (float(tau),)) for tau in lags[::2]]
+            if kind == "time":
+                courses.append(Course(name, "linear", (), reference))
+                courses += _courses_of_time(name, since, span, spacing)
+    return courses
+
+
+def _courses_of_time(name: str, since: np.ndarray, span: float, spacing: float) -> list[Course]:
+    """Steps between epochs, ramps, and a comb of periods."""
+    between = 0.5 * (since[1:] + since[:-1])
+    inside = between[2:-2]
+    if len(inside) > 60:
+        inside = inside[np.linspace(0, len(inside) - 1, 60).astype(int)]
+    periods = span / np.arange(1.0, min(span / (2.5 * spacing), 16.0), 0.5)
+    return [
+        *(Course(name, "step", (float(t),)) for t in inside),
+        *(Course(name, "ramp", (float(t),)) for t in np.linspace(0.1, 0.8, 8) * span),
+        *(Course(name, "periodic", (float(period),)) for period in periods),
+    ]
+
+
+def _marks(scene: Scene) -> list[Group]:
+    groups = []
+    terms = next(entry for entry in CATALOGUE if entry.entity == "mark").groups[0]
+    for t, target in enumerate(scene.model.targets):
+        if "points" in target.free:
+            continue
+        groups += [Group(terms, "mark", (t, p)) for p in range(len(target.point_names))]
+    return groups

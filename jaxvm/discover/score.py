@@ -1,0 +1,490 @@
+"""Score every hypothesis at once, with one tangent per port.
+
+With whitened residual r and Jacobian J of the fitted model, M = I - J (J^T J)^-1 J^T. A hypothesis
+with tangents G (one column for each amplitude) has
+
+    score S = G^T M r,   information I = G^T M G,   drop of chi-square S^T I^-1 S,
+    one-step amplitudes -I^-1 S.
+
+M is never formed: with H = J^T J = L L^T, G^T M G = G^T G - Y^T Y, Y = (J L^-T)^T G. A tangent is a
+port's derivative times a pattern over observations times a course over epochs. Observations of one
+epoch, camera, target and local group form a *cell*; inside a cell the course and the scope are
+constant, so all products are summed over cells once for each port and pattern, and thousands of
+courses and scopes cost one matrix product.
+
+Significance: the residuals of every epoch are multiplied by random signs, again and again; the
+largest statistic over all hypotheses in each repetition gives a family-wise p-value that needs no
+independence inside an epoch (wild bootstrap of the scores).
+"""
+
+import math
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxvm.discover.hypotheses import Family, Hypothesis, member
+from jaxvm.network.residual import port_jacobian, whitening
+from jaxvm.network.scene import (
+    Scene,
+    in_scope,
+    observation_driver_table,
+    ranges_in_scope,
+)
+from jaxvm.physics.drivers import pattern
+from jaxvm.physics.forms import BASIS_INDEX, FORMS, evaluate_basis
+from jaxvm.physics.ports import PORT_INDEX
+from jaxvm.solve.adjust import Adjustment
+from jaxvm.solve.arrow import factorise
+from jaxvm.solve.problem import Problem
+from jaxvm.solve.reduced import half_rows, packet_of_rows
+
+FEWEST_EPOCHS = 3.0
+"""A hypothesis that fewer epochs carry than this can't be told from a few bad images."""
+
+
+class Cells(eqx.Module):
+    """Residuals and tangents of a fitted scene, arranged in cells.
+
+    Attributes:
+        tangent: derivative of the whitened residuals with respect to each port.
+        residual: whitened residuals.
+        half: rows of J L^-T, the local part first.
+        group: cells of each local group, padded with the number of cells.
+        group_of: local group of each cell; the number of groups where it has none.
+        epoch: cells of each epoch, padded with the number of cells.
+    """
+
+    tangent: Float[Array, "ports cells rows"]
+    residual: Float[Array, "cells rows"]
+    half: Float[Array, "cells rows halves"]
+    group: Int[Array, "groups width"]
+    group_of: Int[Array, " cells"]
+    epoch: Int[Array, "epochs wide"]
+    n_local: int = eqx.field(static=True)
+
+    def by(self, index: Int[Array, "a b"], values: Float[Array, "... cells"]):
+        """Values of cells gathered by group or epoch; padding reads zero."""
+        zero = jnp.zeros((*values.shape[:-1], 1))
+        return jnp.concatenate([values, zero], axis=-1)[..., index]
+
+
+@dataclass(frozen=True)
+class Arrangement:
+    """Cells, and where the observations behind them are."""
+
+    cells: Cells
+    rows: np.ndarray  # [cells, width] into all observations, padded with their number
+    epoch: np.ndarray  # of each cell
+    drivers: np.ndarray  # observation-like drivers of all observations
+    starts: tuple[int, ...]  # first observation of each table (pixel tables, then ranges)
+    components: int
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Scores of one family: arrays [groups, courses, scopes].
+
+    Attributes:
+        family: the hypotheses.
+        drop: predicted drop of chi-square (of residuals with unit variance).
+        z: the same as a surprise, about -2 ln p, comparable whatever the number of columns.
+        amplitude: one-step amplitudes [groups, courses, scopes, columns].
+        seen: share of the effect that the model does not absorb.
+        valid: hypotheses that were scored.
+    """
+
+    family: Family
+    drop: np.ndarray
+    z: np.ndarray
+    amplitude: np.ndarray
+    seen: np.ndarray
+    valid: np.ndarray
+    variance: float
+
+    @property
+    def n(self) -> int:
+        """Number of hypotheses scored."""
+        return int(self.valid.sum())
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """All families' scores, and the distribution of the largest z under noise."""
+
+    scores: tuple[Scores, ...]
+    null: np.ndarray
+
+    @property
+    def n(self) -> int:
+        """Number of hypotheses scored."""
+        return sum(s.n for s in self.scores)
+
+    def best_z(self) -> float:
+        """Largest statistic."""
+        return max((float(s.z[s.valid].max()) for s in self.scores if s.n), default=-np.inf)
+
+    def p_value(self, z: float) -> float:
+        """Probability that noise alone gives a statistic this large anywhere (family-wise)."""
+        return float((1 + np.sum(self.null >= z)) / (1 + len(self.null)))
+
+
+@eqx.filter_jit
+def _whitened(problem: Problem, x):
+    """Half rows, residuals and port tangents of all tables on which effects act."""
+    factors = factorise(problem.normal(x).hessian)
+    flat = problem.flat(x)
+    state = problem.network.layout.restore(flat)
+    residuals = jax.tree.leaves(problem.residual(x))
+    result = []
+    n_effect = len(problem.network.pixels) + (problem.network.ranges is not None)
+    tables = list(zip(problem.network.factors(), problem.packets, residuals, strict=True))
+    for factor, packets, r in tables[:n_effect]:
+        half = half_rows(factors, packets, problem.jacobian(factor, packets, flat), problem.sizes)
+        tangent = port_jacobian(factor, problem.network, state) * whitening(factor)[:, :, None]
+        result.append((half, r, tangent))
+    return result
+
+
+def arrange(adjustment: Adjustment) -> Arrangement:
+    """Arrange residuals and tangents of an adjusted scene in cells."""
+    scene, problem = adjustment.scene, adjustment.problem
+    whitened = _whitened(problem, adjustment.x)
+    n_groups = problem.sizes[1]
+    keys, drivers, halves, residuals, tangents, starts = [], [], [], [], [], []
+    components = max(r.shape[1] for _, r, _ in whitened)
+    obs = scene.recording.observations
+    tables = zip(problem.network.factors(), problem.packets, whitened, strict=False)
+    for number, (factor, packets, (half, r, tangent)) in enumerate(tables):
+        n = factor.n_real
+        starts.append(sum(len(k) for k in keys))
+        columns = np.asarray(packets.columns)[np.asarray(packet_of_rows(packets, len(r)))[:n]]
+        local = columns - problem.sizes[0]
+        inside = (local >= 0) & (columns < problem.n)
+        group = np.where(inside, local // max(problem.sizes[2], 1), -1).max(axis=1, initial=-1)
+        if number < len(scene.tables):
+            rows = scene.tables[number]
+            entity = obs.camera[rows] * len(scene.model.targets) + obs.target[rows]
+            table = observation_driver_table(scene, factor, rows)
+            drivers.append(np.asarray(table)[:n])
+        else:
+            ranges = scene.recording.ranges
+            first = len(scene.model.cameras) * len(scene.model.targets)
+            entity = first + ranges.rangefinder * len(scene.model.targets) + ranges.target
+            blank = np.zeros((n, drivers[0].shape[1]))
+            blank[:, 0] = 1.0
+            drivers.append(blank)
+        keys.append(np.stack([group, np.asarray(factor.epoch)[:n], entity], axis=1))
+        pad = [(0, 0), (0, components - r.shape[1])]
+        halves.append(np.pad(np.asarray(half)[:n], [*pad, (0, 0)]))
+        residuals.append(np.pad(np.asarray(r)[:n], pad))
+        tangents.append(np.pad(np.asarray(tangent)[:n], [*pad, (0, 0)]))
+    key = np.concatenate(keys)
+    distinct, cell = np.unique(key, axis=0, return_inverse=True)
+    rows = _padded_lists(cell.ravel(), len(distinct), len(key))
+
+    def in_cells(parts):
+        values = np.concatenate(parts)
+        values = np.concatenate([values, np.zeros((1, *values.shape[1:]))])[rows]
+        return values.reshape(len(distinct), rows.shape[1] * components, *values.shape[3:])
+
+    cells = Cells(
+        tangent=jnp.asarray(np.moveaxis(in_cells(tangents), 2, 0)),
+        residual=jnp.asarray(in_cells(residuals)),
+        half=jnp.asarray(in_cells(halves)),
+        group=jnp.asarray(_padded_lists(distinct[:, 0], n_groups, len(distinct))),
+        group_of=jnp.asarray(np.where(distinct[:, 0] < 0, n_groups, distinct[:, 0])),
+        epoch=jnp.asarray(
+            _padded_lists(distinct[:, 1], len(scene.recording.time), len(distinct))
+        ),
+        n_local=problem.sizes[2],
+    )
+    return Arrangement(
+        cells, rows, distinct[:, 1], np.concatenate(drivers), tuple(starts), components
+    )
+
+
+def _padded_lists(label: np.ndarray, n_labels: int, filler: int) -> np.ndarray:
+    """Positions of each label 0..n-1 as rows of equal length, filled up with `filler`."""
+    kept = np.flatnonzero(label >= 0)
+    counts = np.bincount(label[kept], minlength=n_labels)
+    lists = np.full((n_labels, max(int(counts.max(initial=0)), 1)), filler)
+    order = kept[np.argsort(label[kept], kind="stable")]
+    first = np.concatenate([[0], np.cumsum(counts)])[:-1]
+    lists[label[order], np.arange(len(order)) - first[label[order]]] = order
+    return lists
+
+
+def score(
+    adjustment: Adjustment,
+    families: tuple[Family, ...],
+    variance: float,
+    repetitions: int = 499,
+    seed: int = 0,
+) -> tuple[Ranking, Arrangement]:
+    """Score all hypotheses on an adjusted scene.
+
+    Args:
+        adjustment: the fitted model.
+        families: hypotheses.
+        variance: variance of unit weight of the residuals.
+        repetitions: sign-flips for the null distribution.
+        seed: of the sign-flips.
+    """
+    arrangement = arrange(adjustment)
+    n_epochs = len(adjustment.scene.recording.time)
+    signs = np.random.default_rng(seed).choice([-1.0, 1.0], (n_epochs, repetitions))
+    return score_residuals(adjustment.scene, arrangement, families, variance, signs), arrangement
+
+
+def score_residuals(
+    scene: Scene,
+    arrangement: Arrangement,
+    families: tuple[Family, ...],
+    variance: float,
+    signs: np.ndarray,
+    residual: np.ndarray | None = None,
+) -> Ranking:
+    """Score all hypotheses against the arranged residuals, or against another vector.
+
+    With another vector e (whitened, like all observations, and orthogonal to the model's
+    tangents) the drop is the part of |e|^2 that a hypothesis explains: how much it resembles e.
+    """
+    cells = arrangement.cells
+    if residual is not None:
+        padded = np.concatenate([residual, np.zeros((1, arrangement.components))])
+        own = padded[arrangement.rows].reshape(cells.residual.shape)
+        cells = eqx.tree_at(lambda c: c.residual, cells, jnp.asarray(own))
+    results, null = [], np.full(signs.shape[1], -np.inf)
+    for family in families:
+        ports, patterns = _group_arrays(scene, arrangement, family)
+        weights = _course_weights(scene, arrangement, family)
+        n_courses, n_scopes = len(family.courses), len(family.scopes)
+        valid = family.valid.reshape(len(family.groups), n_courses * n_scopes)
+        # Only pairs of course and scope that some group uses are computed.
+        used = np.flatnonzero(valid.any(axis=0))
+        drop, z, amplitude, seen, sound, largest = _kernel(
+            cells,
+            jnp.asarray(ports),
+            jnp.asarray(patterns),
+            jnp.asarray(weights[used]),
+            jnp.asarray(valid[:, used]),
+            jnp.asarray(signs),
+            jnp.asarray(variance),
+        )
+        null = np.maximum(null, np.asarray(largest))
+
+        def spread(values, fill=0.0, used=used, shape=(len(family.groups), n_courses, n_scopes)):
+            values = np.asarray(values)
+            full = np.full((shape[0], shape[1] * shape[2], *values.shape[2:]), fill, values.dtype)
+            full[:, used] = values
+            return full.reshape(*shape, *values.shape[2:])
+
+        results.append(
+            Scores(
+                family,
+                spread(drop),
+                spread(z, -np.inf),
+                spread(amplitude),
+                spread(seen),
+                spread(sound, False),
+                variance,
+            )
+        )
+    return Ranking(tuple(results), null)
+
+
+def _group_arrays(scene: Scene, arrangement: Arrangement, family: Family):
+    """Port numbers [groups, terms] and patterns [groups, terms, cells, rows] of a family."""
+    ports = np.array([[PORT_INDEX[t.port] for t in g.terms] for g in family.groups])
+    drivers = jnp.asarray(arrangement.drivers)
+    known: dict[tuple, np.ndarray] = {}
+    shape = (len(family.groups), family.n_terms, *arrangement.rows.shape)
+    patterns = np.zeros(shape)
+    for g, group in enumerate(family.groups):
+        for k, term in enumerate(group.terms):
+            key = (term.driver, term.basis, term.constants)
+            if key not in known:
+                values = np.append(np.asarray(pattern(term, drivers)), 0.0)
+                known[key] = values[arrangement.rows]
+            own = known[key]
+            if group.mark is not None:
+                own = own * _mark_mask(scene, arrangement, group.mark)
+            patterns[g, k] = own * term.weight
+    return ports, patterns
+
+
+def _mark_mask(scene: Scene, arrangement: Arrangement, mark: tuple[int, int]) -> np.ndarray:
+    obs = scene.recording.observations
+    own = np.zeros(len(arrangement.drivers) + 1)
+    for start, rows in zip(arrangement.starts, scene.tables, strict=False):
+        own[start : start + len(rows)] = (obs.target[rows] == mark[0]) & (obs.point[rows] == mark[1])
+    return own[arrangement.rows]
+
+
+def _course_weights(scene: Scene, arrangement: Arrangement, family: Family) -> np.ndarray:
+    """Weights [courses * scopes, bases, cells]: the course at the cell's epoch, in scope."""
+    course = course_table(scene, family)[:, :, arrangement.epoch]
+    inside = np.concatenate(
+        [
+            np.stack([in_scope(scene, scope, rows) for rows in scene.tables], axis=0)
+            if len(scene.tables) == 1
+            else np.concatenate([in_scope(scene, scope, rows) for rows in scene.tables])[None]
+            for scope in family.scopes
+        ]
+    )
+    if scene.network.ranges is not None:
+        ranges = np.stack([ranges_in_scope(scene, scope) for scope in family.scopes])
+        inside = np.concatenate([inside, ranges], axis=1)
+    first = arrangement.rows.min(axis=1)  # any observation speaks for its cell
+    inside = inside[:, first]
+    weights = course[:, None] * inside[None, :, None]
+    return weights.reshape(-1, family.n_bases, len(first))
+
+
+def course_table(scene: Scene, family: Family) -> np.ndarray:
+    """Courses [courses, bases, epochs] of a family, at the epochs."""
+    channels = scene.network.channels
+    x, basis, constants = [], [], []
+    for course in family.courses:
+        form = FORMS[course.form]
+        reference = course.reference if form.centred else 0.0
+        for name in form.bases:
+            x.append(np.asarray(channels.values[channels.index(course.driver)]) - reference)
+            basis.append(BASIS_INDEX[name])
+            constants.append((*course.constants, 1.0, 1.0)[:2])
+    table = _evaluate(channels, *(jnp.asarray(v) for v in (basis, x, constants)))
+    return np.asarray(table).reshape(len(family.courses), family.n_bases, -1)
+
+
+@eqx.filter_jit
+def _evaluate(channels, basis, x, constants):
+    on_grid = jax.lax.map(
+        lambda v: evaluate_basis(v[0], v[1], channels.time, v[2]),
+        (basis, x, constants),
+        batch_size=64,
+    )
+    return channels.at_epochs(on_grid)
+
+
+@eqx.filter_jit
+def _kernel(
+    cells: Cells,
+    ports: Int[Array, "groups terms"],
+    patterns: Float[Array, "groups terms cells observations"],
+    weights: Float[Array, "b bases cells"],
+    valid: Bool[Array, "groups b"],
+    signs: Float[Array, "epochs repetitions"],
+    variance: Float[Array, ""],
+):
+    """Drop, z, amplitudes, visible share, soundness [groups, b, ...], largest z per repetition."""
+    d = cells.n_local
+    b, n_bases, _ = weights.shape
+    columns = ports.shape[1] * n_bases
+    by_group = cells.by(cells.group, weights)  # b i G w
+    by_epoch = cells.by(cells.epoch, weights)  # b i E w
+    zero = jnp.zeros((1, *cells.half.shape[1:]))
+    padded_half = jnp.concatenate([cells.half[:, :, d:], zero[:, :, d:]])
+    residual = _without_local(cells)
+    padded_residual = jnp.concatenate([residual, jnp.zeros((1, residual.shape[1]))])
+    # What each epoch contributes to the gradient of the shared unknowns.
+    pull = jnp.einsum(
+        "ewr,ewrs->es", padded_residual[cells.epoch], padded_half[cells.epoch]
+    )
+
+    def one(inputs):
+        port, own_pattern, own_valid = inputs
+        components = cells.residual.shape[1] // own_pattern.shape[2]
+        tangent = cells.tangent[port] * jnp.repeat(own_pattern, components, axis=2)  # k n r
+        square = jnp.einsum("knr,lnr->nkl", tangent, tangent)
+        product = jnp.einsum("knr,nr->kn", tangent, residual)
+        halves = jnp.einsum("knr,nrs->nks", tangent, cells.half)
+        gram = jnp.einsum("bin,bjn,nkl->bkilj", weights, weights, square)
+        gram = jnp.reshape(gram, (b, columns, columns))
+        shared = jnp.einsum("bin,nks->bkis", weights, halves[:, :, d:])
+        shared = jnp.reshape(shared, (b, columns, -1))
+        absorbed = jnp.einsum("bcs,bds->bcd", shared, shared)
+        if d:
+            local_halves = jnp.moveaxis(halves[:, :, :d], 0, -1)  # k s n
+            of_group = cells.by(cells.group, local_halves)  # k s G w
+            local = jnp.einsum("bigw,ksgw->gbkis", by_group, of_group)
+            local = jnp.reshape(local, (local.shape[0], b, columns, d))
+            absorbed = absorbed + jnp.einsum("gbcs,gbds->bcd", local, local)
+        information = gram - absorbed
+        of_epoch = cells.by(cells.epoch, product)  # k E w
+        parts = jnp.einsum("biew,kew->bkie", by_epoch, of_epoch)
+        parts = jnp.reshape(parts, (b, columns, -1)) - jnp.einsum("bcs,es->bce", shared, pull)
+
+        # Directions that the model absorbs to eight digits carry no information.
+        size = jnp.diagonal(gram, axis1=1, axis2=2)
+        unit = 1.0 / jnp.sqrt(jnp.where(size > 0.0, size, 1.0))
+        scaled = information * unit[:, :, None] * unit[:, None, :]
+        root = jnp.linalg.cholesky(scaled + 1e-8 * jnp.eye(columns))
+        whiten = jax.vmap(lambda m, v: jax.scipy.linalg.solve_triangular(m, v, lower=True))
+        part_w = whiten(root, parts * unit[:, :, None])  # b c e
+        score_w = jnp.sum(part_w, axis=2)
+        drop = jnp.sum(score_w**2, axis=1)
+        back = jax.vmap(
+            lambda m, v: jax.scipy.linalg.solve_triangular(m, v, lower=True, trans=1)
+        )(root, score_w)
+        amplitude = -back * unit
+        flipped = jnp.einsum("bce,er->bcr", part_w, signs)
+        null_drop = jnp.sum(flipped**2, axis=1)
+
+        seen = jnp.max(jnp.diagonal(scaled, axis1=1, axis2=2), axis=1)
+        of_epoch_square = cells.by(cells.epoch, jnp.einsum("nkk->n", square))  # E w
+        weight_square = jnp.einsum("biew,ew->be", by_epoch**2, of_epoch_square)
+        total = jnp.sum(weight_square, axis=1)
+        carried = total**2 / jnp.maximum(jnp.sum(weight_square**2, axis=1), 1e-300)
+        fewest = min(FEWEST_EPOCHS, 0.5 * cells.epoch.shape[0])
+        sound = own_valid & (seen > 1e-6) & (total > 0.0) & (carried >= fewest)
+        z = surprise(drop / variance, columns)
+        null_z = surprise(null_drop / variance, columns)
+        largest = jnp.max(jnp.where(sound[:, None], null_z, -jnp.inf), axis=0, initial=-jnp.inf)
+        return drop, jnp.where(sound, z, -jnp.inf), amplitude, seen, sound, largest
+
+    drop, z, amplitude, seen, sound, largest = jax.lax.map(one, (ports, patterns, valid))
+    return drop, z, amplitude, seen, sound, jnp.max(largest, axis=0)
+
+
+def _without_local(cells: Cells) -> Float[Array, "cells rows"]:
+    """Residuals without the part that the local unknowns explain.
+
+    At the minimum there is none; another vector may have one. The local columns of the half rows
+    are orthonormal within a group.
+    """
+    d = cells.n_local
+    if not d:
+        return cells.residual
+    own = jnp.einsum("nr,nrd->dn", cells.residual, cells.half[:, :, :d])
+    of_group = jnp.sum(cells.by(cells.group, own), axis=2)  # d G
+    back = jnp.concatenate([of_group, jnp.zeros((d, 1))], axis=1)[:, cells.group_of]
+    return cells.residual - jnp.einsum("dn,nrd->nr", back, cells.half[:, :, :d])
+
+
+def surprise(chi_square: Float[Array, "..."], columns: int) -> Float[Array, "..."]:
+    """About -2 ln p of a chi-square statistic: comparable whatever the number of columns.
+
+    The leading term of the upper tail, p ~ x^(s-1) e^-x / Gamma(s) with s = columns/2, x = half the
+    statistic; below the mean, where it does not hold, the statistic is taken at the mean.
+    """
+    x = 0.5 * jnp.maximum(chi_square, columns)
+    return 2.0 * (x - (0.5 * columns - 1.0) * jnp.log(x) + math.lgamma(0.5 * columns))
+
+
+def top(ranking: Ranking, scene: Scene, count: int) -> list[tuple[Hypothesis, float, np.ndarray]]:
+    """The leading hypotheses by z: (hypothesis, drop, one-step amplitudes)."""
+    entries = []
+    for scores in ranking.scores:
+        flat = np.where(scores.valid, scores.z, -np.inf).ravel()
+        for position in np.argsort(-flat)[:count]:
+            if np.isfinite(flat[position]):
+                entries.append((flat[position], scores, np.unravel_index(position, scores.z.shape)))
+    entries.sort(key=lambda entry: -entry[0])
+    return [
+        (member(s.family, index, scene), float(s.drop[index]), s.amplitude[index])
+        for _, s, index in entries[:count]
+    ]

@@ -1,0 +1,203 @@
+"""Choose among hypotheses: refit the leading ones, weigh fit, size of the model and plausibility.
+
+The evidence is on the scale of chi-square (twice the log of a posterior weight, Laplace/BIC):
+
+    E = drop / variance - columns ln n + 2 ln prior.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from jaxvm.discover.hypotheses import Hypothesis
+from jaxvm.discover.score import Arrangement, Ranking, score_residuals, top
+from jaxvm.network.scene import Scene
+from jaxvm.physics.effects import Effect
+from jaxvm.physics.forms import FORMS
+from jaxvm.solve.adjust import Adjustment, adjust
+
+DECIDED = 2.0 * np.log(20.0)
+"""Gap in chi-square at which one hypothesis is twenty times as likely as another."""
+
+UNNAMED_PRIOR = 0.01
+"""Weight of a hypothesis that no engineer has a name for, against one of the catalogue."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A hypothesis refitted together with everything found so far."""
+
+    hypothesis: Hypothesis
+    adjustment: Adjustment
+    evidence: float
+
+    @property
+    def effect(self) -> Effect:
+        """The effect with its refitted values."""
+        return self.adjustment.scene.fitted_effects()[-1]
+
+
+@dataclass(frozen=True)
+class Rival:
+    """A hypothesis that the recording can't tell from the chosen one."""
+
+    hypothesis: Hypothesis
+    gap: float
+    weight: float
+
+
+def log_prior(hypothesis: Hypothesis, amplitudes: np.ndarray) -> float:
+    """Log plausibility: named physics of a plausible size is preferred."""
+    if not hypothesis.entries:
+        return float(np.log(UNNAMED_PRIOR))
+    size = float(np.linalg.norm(amplitudes[:: len(FORMS[hypothesis.course.form].bases)]))
+    if size == 0.0:
+        return 0.0
+    best = -np.inf
+    for entry in hypothesis.entries:
+        low, high = entry.plausible
+        decades = max(np.log10(low / size), np.log10(size / high), 0.0)
+        best = max(best, -3.0 * decades)
+    return max(best, float(np.log(UNNAMED_PRIOR)))
+
+
+def evidence(
+    hypothesis: Hypothesis, drop: float, amplitudes: np.ndarray, variance: float, n: int
+) -> float:
+    """Evidence of a hypothesis from its drop of chi-square."""
+    unknowns = len(amplitudes) + len(hypothesis.course.constants)
+    prior = log_prior(hypothesis, np.asarray(amplitudes))
+    return drop / variance - unknowns * np.log(n) + 2.0 * prior
+
+
+def identity(hypothesis: Hypothesis) -> tuple:
+    """What makes two hypotheses different physics: names, driver and place, not constants."""
+    names = tuple(entry.id for entry in hypothesis.entries[:1]) or hypothesis.group.terms
+    return names, hypothesis.course.driver, hypothesis.scope
+
+
+def shortlist(ranking: Ranking, scene: Scene, variance: float, n: int, count: int):
+    """The best hypotheses by evidence, one for each physics, place and kind of course.
+
+    Returns (hypothesis, evidence, one-step amplitudes), best first.
+    """
+    seen, chosen = set(), []
+    weighed = [
+        (hypothesis, evidence(hypothesis, drop, amplitudes, variance, n), amplitudes)
+        for hypothesis, drop, amplitudes in top(ranking, scene, 400)
+    ]
+    for hypothesis, own, amplitudes in sorted(weighed, key=lambda item: -item[1]):
+        key = (identity(hypothesis), hypothesis.course.form)
+        if key not in seen:
+            seen.add(key)
+            chosen.append((hypothesis, own, amplitudes))
+        if len(chosen) == count:
+            break
+    return chosen
+
+
+def refit(
+    base: Adjustment, hypothesis: Hypothesis, amplitudes, room, weights, range_weights, n: int
+) -> Candidate | None:
+    """Refit everything with a hypothesis in, nonlinear constants free.
+
+    None where the fit fails or a constant leaves the range that the recording can show.
+    """
+    # From amplitude zero the first step moves everything together.
+    effects = (*base.scene.fitted_effects(), hypothesis.effect(0.0 * amplitudes))
+    scene = base.scene.with_effects(effects, room)
+    fitted = adjust(
+        scene, weights=weights, range_weights=range_weights, rtol=1e-8, check=False
+    )
+    effect = fitted.scene.fitted_effects()[-1]
+    if not np.isfinite(fitted.cost) or not _sensible(scene, effect):
+        # The grid's constants are good enough when a refined one runs away.
+        still = hypothesis_constants_held(scene)
+        fitted = adjust(
+            scene,
+            weights=weights,
+            range_weights=range_weights,
+            active=still,
+            rtol=1e-8,
+            check=False,
+        )
+        effect = fitted.scene.fitted_effects()[-1]
+        if not np.isfinite(fitted.cost):
+            return None
+    variance = fitted.variance_factor
+    drop = 2.0 * (base.cost - fitted.cost)
+    own = evidence(hypothesis, drop, np.asarray(effect.amplitudes), variance, n)
+    return Candidate(hypothesis, fitted, own)
+
+
+def hypothesis_constants_held(scene: Scene) -> np.ndarray:
+    """Active unknowns of a scene with all nonlinear constants held."""
+    active = scene.unknowns.active.copy()
+    columns = scene.unknowns.column[scene.network.layout.all("constant")]
+    active[columns[columns < scene.unknowns.n]] = False
+    return active
+
+
+def _sensible(scene: Scene, effect: Effect) -> bool:
+    """Whether refined constants stayed positive and within reach of the recording."""
+    time = np.asarray(scene.network.channels.epoch_time)
+    span = float(np.ptp(time)) or 1.0
+    for constant, value in zip(FORMS[effect.form].constants, effect.constants, strict=True):
+        if not np.isfinite(value) or value <= 0.0:
+            return False
+        if constant.unit == "s" and value > 3.0 * span:
+            return False
+    return True
+
+
+def rivals(
+    scene: Scene,
+    arrangement: Arrangement,
+    ranking: Ranking,
+    chosen: Candidate,
+    before: Adjustment,
+    n: int,
+) -> tuple[float, list[Rival]]:
+    """Hypotheses that the recording can't tell from the chosen one at 20:1.
+
+    With e the chosen effect as it stands in the residuals and lambda = |e|^2 its drop of
+    chi-square, a hypothesis that explains the share rho^2 of e is worse by lambda (1 - rho^2).
+
+    Returns:
+        The posterior weight of the chosen one, and its rivals with theirs.
+    """
+    variance = chosen.adjustment.variance_factor
+    change = _stacked(before) - _stacked(chosen.adjustment)
+    full = float(np.sum(change**2)) / variance
+    still = np.zeros((len(scene.recording.time), 1))
+    families = tuple(s.family for s in ranking.scores)
+    alike = score_residuals(scene, arrangement, families, variance, still, residual=change)
+    own_identity = identity(chosen.hypothesis)
+    penalty = len(chosen.effect.amplitudes) + len(chosen.effect.constants)
+    own_prior = log_prior(chosen.hypothesis, np.asarray(chosen.effect.amplitudes))
+    found: dict[tuple, Rival] = {}
+    for hypothesis, drop, amplitudes in top(alike, scene, 400):
+        gap = max(full - drop / variance, 0.0)
+        key = identity(hypothesis)
+        if gap > DECIDED or key == own_identity:
+            continue
+        cost = len(amplitudes) + len(hypothesis.course.constants)
+        prior = log_prior(hypothesis, np.asarray(amplitudes))
+        log_odds = -0.5 * gap - 0.5 * (cost - penalty) * np.log(n) + prior - own_prior
+        if key not in found or log_odds > found[key].weight:
+            found[key] = Rival(hypothesis, float(gap), float(log_odds))
+    odds = np.array([0.0, *(r.weight for r in found.values())])
+    weights = np.exp(odds - np.logaddexp.reduce(odds))
+    pairs = zip(found.values(), weights[1:], strict=True)
+    kept = [replace(r, weight=float(w)) for r, w in pairs if w >= 0.01]
+    return float(weights[0]), sorted(kept, key=lambda r: -r.weight)
+
+
+def _stacked(adjustment: Adjustment) -> np.ndarray:
+    """Whitened residuals of the tables on which effects act, padded to one width."""
+    residuals = adjustment.residuals()
+    blocks = [np.asarray(b) for b in residuals.pixels]
+    if residuals.ranges is not None:
+        ranges = np.asarray(residuals.ranges)
+        blocks.append(np.pad(ranges, [(0, 0), (0, blocks[0].shape[1] - 1)]))
+    return np.concatenate(blocks)
