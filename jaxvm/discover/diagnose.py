@@ -6,7 +6,7 @@ significant is left. No finding is claimed that does not pass on epochs which we
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from jaxvm.network.start import start
 from jaxvm.physics.effects import Effect, capacity
 from jaxvm.recording import Recording
 from jaxvm.solve.adjust import Adjustment, adjust, reference_sigma
-from jaxvm.solve.covariance import standard_deviations
+from jaxvm.solve.covariance import standard_deviations, wald_drops
 from jaxvm.solve.snooping import robust_variance
 
 ALPHA = 0.01
@@ -39,6 +39,8 @@ GROSS = 12.0
 
 _ROOM = (12, 4)
 _CANDIDATES = 4
+_NEAR = 30.0
+_FLIPS = 299
 
 
 @dataclass(frozen=True)
@@ -175,6 +177,7 @@ def diagnose(
     if n_rejected:
         base = _fit(base.scene, split)
     plain_heldout = evaluate(base.scene, held, sound)
+    base = replace(base, scene=plain_heldout.scene)
     plain = base
     n = sum(int(w.sum()) * 2 for w in split.weights)
 
@@ -186,7 +189,7 @@ def diagnose(
         progress(f"scoring hypotheses (round {len(findings) + 1})")
         families = enumerate_hypotheses(current.scene)
         variance = robust_variance(current)
-        ranking, arrangement = score(current, families, variance, seed=seed)
+        ranking, arrangement = score(current, families, variance, _FLIPS, seed)
         p_value = ranking.p_value(ranking.best_z())
         if p_value > alpha or len(findings) == max_findings:
             break
@@ -215,7 +218,7 @@ def diagnose(
         )
         candidates.append(chosen)
         progress(f"found: {chosen.effect.name} ({chosen.effect.scope.words()})")
-        current, best_heldout = chosen.adjustment, heldout
+        current, best_heldout = replace(chosen.adjustment, scene=heldout.scene), heldout
         current, findings = _prune(current, findings, split, n)
 
     progress("final fit to all epochs")
@@ -295,14 +298,18 @@ def _accept(current, leading, split: _Fits, n: int, heldout: HeldOut, held, soun
         current.scene.state.constant.shape[0],
     )
     refitted = []
-    for hypothesis, _, amplitudes in leading[:_CANDIDATES]:
+    # One tangent foretells a drop to a few percent: only near ties need a refit.
+    least = leading[0][1] - max(_NEAR, 0.15 * abs(leading[0][1]))
+    for hypothesis, own, amplitudes in leading[:_CANDIDATES]:
+        if own < least:
+            continue
         candidate = refit(
             current, hypothesis, amplitudes, room, split.weights, split.range_weights, n
         )
         if candidate is not None:
             refitted.append(candidate)
     refitted = sorted(refitted, key=lambda c: -_common_evidence(c, refitted, current, n))
-    for candidate in refitted[:2]:
+    for candidate in refitted:
         tried = evaluate(candidate.adjustment.scene, held, sound)
         proof = gain(heldout, tried, seed)
         if proof.proven:
@@ -319,15 +326,20 @@ def _common_evidence(candidate: Candidate, all_candidates, current: Adjustment, 
 
 
 def _prune(current: Adjustment, findings: list[Finding], split: _Fits, n: int):
-    """Drop earlier findings that the later ones made superfluous (Wald test against BIC)."""
+    """Drop an earlier finding that the later ones made superfluous (Wald test against BIC)."""
     given = len(current.scene.effects) - len(findings)
-    variance = current.variance_factor
-    for k in range(len(findings) - 1):
-        kept = [e for i, e in enumerate(current.scene.fitted_effects()) if i != given + k]
-        room = (current.scene.network.effects.n_columns, current.scene.state.constant.shape[0])
-        without = _fit(current.scene.with_effects(tuple(kept), room), split)
-        columns = len(findings[k].effect.amplitudes) + len(findings[k].effect.constants)
-        if 2.0 * (without.cost - current.cost) / variance < columns * np.log(n):
+    amplitude = current.scene.network.layout.all("amplitude")
+    ends = np.cumsum([effect.n_columns for effect in current.scene.effects])
+    groups = [amplitude[end - e.n_columns : end]
+              for e, end in zip(current.scene.effects, ends, strict=True)]  # fmt: skip
+    drops = wald_drops(current, groups[given:])
+    for k, (finding, drop) in enumerate(zip(findings[:-1], drops, strict=False)):
+        columns = len(finding.effect.amplitudes) + len(finding.effect.constants)
+        if drop / current.variance_factor < columns * np.log(n):
+            effects = current.scene.fitted_effects()
+            kept = (*effects[: given + k], *effects[given + k + 1 :])
+            room = (current.scene.network.effects.n_columns, current.scene.state.constant.shape[0])
+            without = _fit(current.scene.with_effects(kept, room), split)
             return without, findings[:k] + findings[k + 1 :]
     return current, findings
 

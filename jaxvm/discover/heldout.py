@@ -22,12 +22,14 @@ class HeldOut:
         square: sum of squares of each held-out epoch (whitened).
         count: pixel coordinates in each held-out epoch.
         range_square: whitened sum of squares of ranges in the held-out epochs.
+        scene: the scene with the poses of the held-out epochs fitted.
     """
 
     rms_px: float
     square: np.ndarray
     count: np.ndarray
     range_square: float
+    scene: Scene
 
 
 @dataclass(frozen=True)
@@ -80,6 +82,8 @@ def evaluate(scene: Scene, held: np.ndarray, sound: tuple[np.ndarray, ...]) -> H
         weights=weights,
         range_weights=range_weights_of(scene, held),
         active=scene.unknowns.of_one_epoch,
+        rtol=1e-8,
+        damping=1e-6,
         check=False,
     )
     residuals = fitted.residuals()
@@ -90,7 +94,7 @@ def evaluate(scene: Scene, held: np.ndarray, sound: tuple[np.ndarray, ...]) -> H
         np.add.at(count, epoch[rows], 2.0 * (weight > 0))
     ranges = 0.0 if residuals.ranges is None else float(np.sum(np.asarray(residuals.ranges) ** 2))
     rms = float(np.sqrt(square[held].sum() / max(count[held].sum(), 1.0)))
-    return HeldOut(rms * reference_sigma(scene), square[held], count[held], ranges)
+    return HeldOut(rms * reference_sigma(scene), square[held], count[held], ranges, fitted.scene)
 
 
 def gain(before: HeldOut, after: HeldOut, seed: int = 0, repetitions: int = 2000) -> Gain:

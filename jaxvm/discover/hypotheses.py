@@ -19,7 +19,7 @@ _ENTITY_OF_STAGE = {
     "target": "target",
     "structure": "target",
     "station": "station",
-    "medium": "camera",
+    "medium": "station",
     "shutter": "camera",
     "mount": "camera",
     "lens": "camera",
@@ -133,7 +133,7 @@ def enumerate_hypotheses(scene: Scene) -> tuple[Family, ...]:
     """All hypotheses that a recording can be asked about."""
     scopes = _scopes(scene)
     courses = _courses(scene)
-    single = [Group((Term(port.name),), _ENTITY_OF_STAGE[port.stage]) for port in PORTS]
+    single = [Group((Term(port.name),), _entity(port.name)) for port in PORTS]
     patterned = [
         Group((Term(port, driver, basis, constants),), "camera")
         for port in _PATTERNED_PORTS
@@ -198,14 +198,16 @@ def _family(groups, courses, scopes) -> Family:
                 if group.mark is not None:
                     valid[g, c, s] = s == 0
                     continue
-                valid[g, c, s] = kinds[s] == group.entity or (
-                    # Air belongs to all cameras of a station alike.
-                    kinds[s] == "station" and _STAGE[group.terms[0].port] == "medium"
-                )
+                valid[g, c, s] = kinds[s] == group.entity
                 if course.driver.startswith("time since power-on of "):
                     camera = course.driver.removeprefix("time since power-on of ")
                     valid[g, c, s] &= scope.camera == (camera,)
     return Family(tuple(groups), tuple(courses), tuple(scopes), valid)
+
+
+def _entity(port: str) -> str:
+    # A window belongs to its camera, the air to all cameras of a station alike.
+    return "camera" if port == "medium.window" else _ENTITY_OF_STAGE[_STAGE[port]]
 
 
 def _kind(scope: Scope) -> str:

@@ -19,6 +19,9 @@ from jaxvm.solve.adjust import Adjustment, adjust
 DECIDED = 2.0 * np.log(20.0)
 """Gap in chi-square at which one hypothesis is twenty times as likely as another."""
 
+CLEAR = 15.0
+"""Difference of foretold evidence between two courses of the same terms that a refit won't turn."""
+
 UNNAMED_PRIOR = 0.01
 """Weight of a hypothesis that no engineer has a name for, against one of the catalogue."""
 
@@ -81,16 +84,21 @@ def shortlist(ranking: Ranking, scene: Scene, variance: float, n: int, count: in
 
     Returns (hypothesis, evidence, one-step amplitudes), best first.
     """
-    seen, chosen = set(), []
+    seen: dict[tuple, float] = {}
+    chosen = []
     weighed = [
         (hypothesis, evidence(hypothesis, drop, amplitudes, variance, n), amplitudes)
         for hypothesis, drop, amplitudes in top(ranking, scene, 400)
     ]
     for hypothesis, own, amplitudes in sorted(weighed, key=lambda item: -item[1]):
+        # The same terms at the same place in another course: only if it is nearly as good.
+        place = (hypothesis.group, hypothesis.scope)
         key = (identity(hypothesis), hypothesis.course.form)
-        if key not in seen:
-            seen.add(key)
-            chosen.append((hypothesis, own, amplitudes))
+        if key in seen or seen.get(place, own) - own > CLEAR:
+            continue
+        seen.setdefault(place, own)
+        seen[key] = own
+        chosen.append((hypothesis, own, amplitudes))
         if len(chosen) == count:
             break
     return chosen
@@ -107,8 +115,9 @@ def refit(
     effects = (*base.scene.fitted_effects(), hypothesis.effect(0.0 * amplitudes))
     scene = base.scene.with_effects(effects, room)
     fitted = adjust(
-        scene, weights=weights, range_weights=range_weights, rtol=1e-8, check=False
-    )
+        scene, weights=weights, range_weights=range_weights, rtol=1e-8,
+        damping=1e-6, max_steps=30, check=False,
+    )  # fmt: skip
     effect = fitted.scene.fitted_effects()[-1]
     if not np.isfinite(fitted.cost) or not _sensible(scene, effect):
         # The grid's constants are good enough when a refined one runs away.
@@ -119,6 +128,8 @@ def refit(
             range_weights=range_weights,
             active=still,
             rtol=1e-8,
+            damping=1e-6,
+            max_steps=30,
             check=False,
         )
         effect = fitted.scene.fitted_effects()[-1]
@@ -169,7 +180,7 @@ def rivals(
     variance = chosen.adjustment.variance_factor
     change = _stacked(before) - _stacked(chosen.adjustment)
     full = float(np.sum(change**2)) / variance
-    still = np.zeros((len(scene.recording.time), 1))
+    still = np.zeros((len(scene.recording.time), len(ranking.null)))
     families = tuple(s.family for s in ranking.scores)
     alike = score_residuals(scene, arrangement, families, variance, still, residual=change)
     own_identity = identity(chosen.hypothesis)

@@ -26,9 +26,9 @@ from jaxvm.network.state import N_DISTORTION, Layout, State
 from jaxvm.network.unknowns import Unknowns, arrange, local_groups
 from jaxvm.physics.chain import Circumstances, Sight
 from jaxvm.physics.drivers import all_observation_drivers, build_channels, pattern
-from jaxvm.physics.effects import Effect, Scope, capacity, tabulate
+from jaxvm.physics.effects import Effect, Scope, capacity, courses, tabulate
 from jaxvm.physics.forms import FORMS
-from jaxvm.physics.ports import PortValues
+from jaxvm.physics.ports import PORTS, PortValues
 from jaxvm.recording import Recording
 
 
@@ -114,34 +114,31 @@ def build(recording: Recording, effects: tuple[Effect, ...] = ()) -> Scene:
         None if recording.drivers is None else recording.drivers.time,
         {c.name: c.powered_on_s for c in model.cameras if c.powered_on_s is not None},
     )
-    index = _Index(recording, layout, station_row, target_row, first_point)
+    empty, _, _ = tabulate((), channels, 0, 1)
+    nothing = np.zeros(0, int)
+    scene = Scene(
+        recording,
+        (),
+        Network((), None, None, None, None, None, empty, channels, layout),
+        state,
+        Unknowns(nothing, nothing, 0, 0, 0, (), nothing, nothing),
+        (),
+        station_row,
+        target_row,
+        first_point,
+    )
+    index = _Index(scene)
     tables, pixels = index.pixel_tables()
     edges, closures = index.closed_links()
-    empty, _, _ = tabulate((), channels, 0, 1)
-    network = Network(
+    network = replace(
+        scene.network,
         pixels=pixels,
         ranges=index.ranges(),
         links=index.links(),
         edges=edges,
         closures=closures,
-        priors=index.priors(),
-        effects=empty,
-        channels=channels,
-        layout=layout,
     )
-    nothing = np.zeros(0, int)
-    scene = Scene(
-        recording,
-        (),
-        network,
-        state,
-        Unknowns(nothing, nothing, 0, 0, 0, (), nothing, nothing),
-        tables,
-        station_row,
-        target_row,
-        first_point,
-    )
-    return scene.with_effects(effects)
+    return replace(scene, network=network, tables=tables).with_effects(effects)
 
 
 def _pose_rows(motions: list[str], n_epochs: int) -> np.ndarray:
@@ -199,13 +196,13 @@ def _given_state(recording, station_row, target_row) -> State:
 class _Index:
     """Turns the names and indices of a recording into slots of the flat state."""
 
-    def __init__(self, recording, layout, station_row, target_row, first_point):
-        self.recording = recording
-        self.model = recording.model
-        self.layout = layout
-        self.station_row = station_row
-        self.target_row = target_row
-        self.first_point = first_point
+    def __init__(self, scene: Scene):
+        self.recording = scene.recording
+        self.model = scene.model
+        self.layout = scene.network.layout
+        self.station_row = scene.station_row
+        self.target_row = scene.target_row
+        self.first_point = scene.first_point
         names = [s.name for s in self.model.stations]
         self.station_of = np.array([names.index(c.station) for c in self.model.cameras], int)
         self.station_of_finder = np.array(
@@ -579,7 +576,40 @@ def _bind(scene: Scene) -> Scene:
                 patterns[:, column : column + n] = (inside * (term.driver == "one"))[:, None]
                 column += n
         network = eqx.tree_at(lambda n: n.ranges.pattern, network, jnp.asarray(patterns))
-    return replace(scene, network=network)
+    return replace(scene, network=_with_amplitude_priors(scene, network))
+
+
+def _with_amplitude_priors(scene: Scene, network: Network) -> Network:
+    """Priors that keep every amplitude of physical size, so that none is undetermined.
+
+    The width is the largest plausible perturbation of the port over the largest value that the
+    column takes; against any real evidence it weighs nothing.
+    """
+    n_columns = network.effects.n_columns
+    given = _Index(scene).priors()
+    if n_columns == 0:
+        return replace(network, priors=given)
+    reach = np.zeros(n_columns)
+    tables = [*network.pixels, *([] if network.ranges is None else [network.ranges])]
+    for factor in tables:
+        reach = np.maximum(reach, np.abs(np.asarray(factor.pattern)).max(axis=0, initial=0.0))
+    own = np.asarray(courses(network.effects, scene.state.constant, network.channels))
+    reach = reach * np.abs(own).max(axis=1)
+    largest = np.abs(np.asarray(network.effects.ports)).T > 0
+    limit = np.where(largest, np.array([port.largest for port in PORTS])[:, None], 0.0).max(axis=0)
+    used = (reach > 0) & (limit > 0)
+    slots = network.layout.all("amplitude")
+    sigma = np.where(used, limit, 1.0) / np.where(used, reach, 1.0)
+    own_priors = PriorFactor(
+        slots=jnp.asarray(slots[:, None]),
+        sigma=jnp.asarray(sigma[:, None]),
+        weight=jnp.asarray(used, float),
+        expected=jnp.zeros(n_columns),
+    )
+    if given is None:
+        return replace(network, priors=own_priors)
+    both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), given, own_priors)
+    return replace(network, priors=both)
 
 
 def observation_driver_table(scene: Scene, factor: PixelFactor, rows: np.ndarray):

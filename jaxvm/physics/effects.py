@@ -88,6 +88,25 @@ class Effect:
         """Number of amplitudes: terms times bases."""
         return len(self.terms) * len(FORMS[self.form].bases)
 
+    def as_dict(self) -> dict:
+        """The effect as a table of recording.toml."""
+        terms = [
+            {"port": t.port, "driver": t.driver, "basis": t.basis, "weight": float(t.weight)}
+            | ({"constants": [float(c) for c in t.constants]} if t.constants else {})
+            for t in self.terms
+        ]
+        return {
+            "name": self.name,
+            "catalogue_id": self.catalogue_id,
+            "terms": terms,
+            "driver": self.driver,
+            "form": self.form,
+            "constants": [float(c) for c in self.constants],
+            "reference": float(self.reference),
+            "scope": self.scope.as_dict(),
+            "amplitudes": [float(a) for a in self.amplitudes] or [0.0] * self.n_columns,
+        }
+
     def with_values(self, amplitudes, constants) -> "Effect":
         """The same effect with estimated amplitudes and constants."""
         return replace(

@@ -33,55 +33,60 @@ class Port:
         name: name in the form `stage.quantity`.
         stage: the stage of the chain where it enters.
         unit: unit of the perturbation ("1" is a ratio).
+        largest: the largest perturbation that is still physics and not a mistake, in its unit; an
+            effect has a prior of this width.
         meaning: what a positive value does, in words.
     """
 
     name: str
     stage: str
     unit: str
+    largest: float
     meaning: str
 
 
-def _axes(prefix: str, stage: str, unit: str, meaning: str) -> tuple[Port, ...]:
-    return tuple(Port(f"{prefix}_{a}", stage, unit, meaning.format(axis=a)) for a in "xyz")
+def _axes(prefix: str, stage: str, unit: str, largest: float, meaning: str) -> tuple[Port, ...]:
+    return tuple(
+        Port(f"{prefix}_{a}", stage, unit, largest, meaning.format(axis=a)) for a in "xyz"
+    )
 
 
 PORTS: tuple[Port, ...] = (
-    Port("target.scale", "target", "1", "the target grows about its centre"),
-    Port("target.scale_x", "target", "1", "the target grows along its x axis only"),
-    Port("target.scale_y", "target", "1", "the target grows along its y axis only"),
-    Port("target.bow_x", "target", "m", "the middle rises along +z against the x edges"),
-    Port("target.bow_y", "target", "m", "the middle rises along +z against the y edges"),
-    Port("target.twist", "target", "m", "the corners where x and y agree in sign rise along +z"),
-    *_axes("target.point", "target", "m", "a mark moves along the target's {axis} axis"),
-    *_axes("structure.shift", "structure", "m", "the target moves along the world's {axis} axis"),
-    *_axes("structure.turn", "structure", "rad", "the target turns about the world's {axis} axis"),
-    Port("clock.offset", "shutter", "s", "the exposure is later than the recorded time"),
-    Port("shutter.row_time", "shutter", "s", "the last row is exposed later than the first"),
-    Port("medium.bend_u", "medium", "rad/m", "a path of length L displaces the mark L²/2 along u"),
-    Port("medium.bend_v", "medium", "rad/m", "a path of length L displaces the mark L²/2 along v"),
-    Port("medium.window", "medium", "m", "thickness of a plane glass plate before the lens"),
-    *_axes("station.turn", "station", "rad", "the station turns about its own {axis} axis"),
-    *_axes("station.shift", "station", "m", "the station moves along its own {axis} axis"),
-    *_axes("mount.turn", "mount", "rad", "the camera turns about its own {axis} axis"),
-    *_axes("mount.shift", "mount", "m", "the camera moves along its own {axis} axis"),
-    Port("lens.k1", "lens", "1", "radial distortion of the third order"),
-    Port("lens.k2", "lens", "1", "radial distortion of the fifth order"),
-    Port("lens.k3", "lens", "1", "radial distortion of the seventh order"),
-    Port("lens.p1", "lens", "1", "decentring distortion, first coefficient"),
-    Port("lens.p2", "lens", "1", "decentring distortion, second coefficient"),
-    Port("lens.tilt_x", "lens", "rad", "the sensor tilts about x behind the lens"),
-    Port("lens.tilt_y", "lens", "rad", "the sensor tilts about y behind the lens"),
-    Port("lens.entrance", "lens", "m", "the entrance pupil moves forward with the field angle²"),
-    Port("sensor.focal", "sensor", "1", "the principal distance grows"),
-    Port("sensor.aspect", "sensor", "1", "the principal distance along u grows"),
-    Port("sensor.cx", "sensor", "px", "the principal point moves along u"),
-    Port("sensor.cy", "sensor", "px", "the principal point moves along v"),
-    Port("sensor.skew", "sensor", "1", "rows shear along u"),
-    Port("detect.u", "detection", "px", "the detector measures u too large"),
-    Port("detect.v", "detection", "px", "the detector measures v too large"),
-    Port("range.offset", "range", "m", "the rangefinder measures too long by a constant"),
-    Port("range.scale", "range", "1", "the rangefinder measures too long in proportion"),
+    Port("target.scale", "target", "1", 0.02, "the target grows about its centre"),
+    Port("target.scale_x", "target", "1", 0.02, "the target grows along its x axis only"),
+    Port("target.scale_y", "target", "1", 0.02, "the target grows along its y axis only"),
+    Port("target.bow_x", "target", "m", 0.05, "the middle rises along +z against the x edges"),
+    Port("target.bow_y", "target", "m", 0.05, "the middle rises along +z against the y edges"),
+    Port("target.twist", "target", "m", 0.05, "the corners where x and y agree in sign rise along +z"),
+    *_axes("target.point", "target", "m", 0.02, "a mark moves along the target's {axis} axis"),
+    *_axes("structure.shift", "structure", "m", 0.5, "the target moves along the world's {axis} axis"),
+    *_axes("structure.turn", "structure", "rad", 0.1, "the target turns about the world's {axis} axis"),
+    Port("clock.offset", "shutter", "s", 0.1, "the exposure is later than the recorded time"),
+    Port("shutter.row_time", "shutter", "s", 0.2, "the last row is exposed later than the first"),
+    Port("medium.bend_u", "medium", "rad/m", 0.0001, "a path of length L displaces the mark L²/2 along u"),
+    Port("medium.bend_v", "medium", "rad/m", 0.0001, "a path of length L displaces the mark L²/2 along v"),
+    Port("medium.window", "medium", "m", 0.05, "thickness of a plane glass plate before the lens"),
+    *_axes("station.turn", "station", "rad", 0.02, "the station turns about its own {axis} axis"),
+    *_axes("station.shift", "station", "m", 0.1, "the station moves along its own {axis} axis"),
+    *_axes("mount.turn", "mount", "rad", 0.02, "the camera turns about its own {axis} axis"),
+    *_axes("mount.shift", "mount", "m", 0.1, "the camera moves along its own {axis} axis"),
+    Port("lens.k1", "lens", "1", 0.3, "radial distortion of the third order"),
+    Port("lens.k2", "lens", "1", 0.3, "radial distortion of the fifth order"),
+    Port("lens.k3", "lens", "1", 0.3, "radial distortion of the seventh order"),
+    Port("lens.p1", "lens", "1", 0.02, "decentring distortion, first coefficient"),
+    Port("lens.p2", "lens", "1", 0.02, "decentring distortion, second coefficient"),
+    Port("lens.tilt_x", "lens", "rad", 0.05, "the sensor tilts about x behind the lens"),
+    Port("lens.tilt_y", "lens", "rad", 0.05, "the sensor tilts about y behind the lens"),
+    Port("lens.entrance", "lens", "m", 0.03, "the entrance pupil moves forward with the field angle²"),
+    Port("sensor.focal", "sensor", "1", 0.05, "the principal distance grows"),
+    Port("sensor.aspect", "sensor", "1", 0.02, "the principal distance along u grows"),
+    Port("sensor.cx", "sensor", "px", 30.0, "the principal point moves along u"),
+    Port("sensor.cy", "sensor", "px", 30.0, "the principal point moves along v"),
+    Port("sensor.skew", "sensor", "1", 0.02, "rows shear along u"),
+    Port("detect.u", "detection", "px", 3.0, "the detector measures u too large"),
+    Port("detect.v", "detection", "px", 3.0, "the detector measures v too large"),
+    Port("range.offset", "range", "m", 0.1, "the rangefinder measures too long by a constant"),
+    Port("range.scale", "range", "1", 0.01, "the rangefinder measures too long in proportion"),
 )
 """All ports, in the order of the chain."""
 

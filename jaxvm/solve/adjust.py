@@ -90,6 +90,7 @@ def adjust(
     range_weights: np.ndarray | None = None,
     active: np.ndarray | None = None,
     rtol: float = 1e-12,
+    damping: float = 1e-3,
     max_steps: int = 100,
     check: bool = True,
 ) -> Adjustment:
@@ -103,6 +104,7 @@ def adjust(
         range_weights: the same for the ranges.
         active: unknowns that may move; all by default.
         rtol: relative change of the cost at which it stops.
+        damping: first damping of Levenberg-Marquardt, relative to a unit diagonal.
         max_steps: bound on evaluations.
         check: look for rank deficiency first.
 
@@ -125,7 +127,10 @@ def adjust(
     problem, normal = scaled(problem, normal_at_start(problem))
     if check:
         check_gauge(normal, scene.unknowns)
-    solution = _minimise(problem, METHODS[method](jnp.asarray(rtol)), max_steps)
+    solver = METHODS[method](
+        jnp.asarray(rtol), limit=jnp.asarray(max_steps), damping=jnp.asarray(damping)
+    )
+    solution = _minimise(problem, solver)
     x = solution.value
     stats = solution.stats
     history = np.asarray(stats["history"])
@@ -165,13 +170,13 @@ def degrees_of_freedom(problem: Problem, normal: Normal) -> int:
 
 
 @eqx.filter_jit
-def _minimise(problem: Problem, solver, max_steps: int):
+def _minimise(problem: Problem, solver):
     return optx.least_squares(
         lambda x, p: p.residual(x),
         solver,
         jnp.zeros(problem.n),
         args=problem,
-        max_steps=max_steps,
+        max_steps=None,
         throw=False,
     )
 
@@ -187,10 +192,10 @@ def _residuals(problem: Problem, x):
 
 
 def _why(solution, stats, max_steps) -> str:
-    if solution.result == optx.RESULTS.successful:
-        return "converged: the cost no longer changes"
     if int(stats["evaluations"]) >= max_steps:
         return f"stopped after {max_steps} evaluations: not converged"
+    if solution.result == optx.RESULTS.successful:
+        return "converged: the cost no longer changes"
     return "failed: the normal equations are singular"
 
 

@@ -10,6 +10,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxvm.network.state import State
@@ -36,6 +37,34 @@ def _covariance(problem: Problem, x, quantity):
     factors = factorise(problem.normal(x).hessian)
     rows = jax.jacrev(lambda y: jnp.ravel(quantity(problem.state(y))))(x)
     return rows @ factors.solve(rows.T)
+
+
+def wald_drops(
+    adjustment: Adjustment, groups: list[np.ndarray]
+) -> list[float]:
+    """How much chi-square would rise if groups of parameters were held at zero: a^T C^-1 a.
+
+    Each group lists positions of the flat state.
+    """
+    positions = np.concatenate(groups)
+    problem = adjustment.problem
+    columns = np.asarray(problem.column)[positions]
+    inverse = np.asarray(_inverse_columns(problem, adjustment.x, jnp.asarray(columns)))[columns]
+    factor = np.asarray(problem.factor)[positions]
+    spread = factor[:, None] * inverse * factor
+    values = np.asarray(problem.flat(adjustment.x))[positions]
+    drops, start = [], 0
+    for group in groups:
+        own = slice(start, start + len(group))
+        drops.append(float(values[own] @ np.linalg.solve(spread[own, own], values[own])))
+        start += len(group)
+    return drops
+
+
+@eqx.filter_jit
+def _inverse_columns(problem: Problem, x, columns):
+    units = jnp.zeros((problem.n, columns.shape[0])).at[columns, jnp.arange(columns.shape[0])].set(1)
+    return factorise(problem.normal(x).hessian).solve(units)
 
 
 def standard_deviations(adjustment: Adjustment, scale: float = 1.0) -> State:

@@ -34,8 +34,10 @@ class _State(eqx.Module):
 class Relaxing(optx.ClassicalTrustRegion):
     """Trust region that starts near Gauss-Newton and opens fast.
 
-    Unknowns are scaled to a unit diagonal, so the damping is relative: it starts at 1e-3.
+    Unknowns are scaled to a unit diagonal, so the damping is relative.
     """
+
+    damping: float | Float[Array, ""] = 1e-3
 
     high_cutoff: float = 0.75
     low_cutoff: float = 1e-4
@@ -44,7 +46,7 @@ class Relaxing(optx.ClassicalTrustRegion):
 
     def init(self, y, f_info_struct):
         state = super().init(y, f_info_struct)
-        return eqx.tree_at(lambda s: s.step_size, state, jnp.array(1e3))
+        return eqx.tree_at(lambda s: s.step_size, state, 1.0 / jnp.asarray(self.damping))
 
 
 class NormalEquationSolver(optx.AbstractLeastSquaresSolver):
@@ -58,6 +60,7 @@ class NormalEquationSolver(optx.AbstractLeastSquaresSolver):
 
     rtol: float | Float[Array, ""]
     atol: float | Float[Array, ""]
+    limit: int | Int[Array, ""]  # evaluations; data, so that another bound is no other program
     norm: Any
     descent: optx.AbstractDescent
     search: optx.AbstractSearch
@@ -110,7 +113,7 @@ class NormalEquationSolver(optx.AbstractLeastSquaresSolver):
             info=kept,
             search=search,
             descent=descent,
-            done=done | hopeless,
+            done=done | hopeless | (state.evaluations + 1 >= self.limit),
             result=result,
             evaluations=state.evaluations + 1,
             accepted=state.accepted + accept,
@@ -129,19 +132,20 @@ class NormalEquationSolver(optx.AbstractLeastSquaresSolver):
         }  # fmt: skip
 
 
-def gauss_newton(rtol=1e-12, atol: float = 1e-9) -> NormalEquationSolver:
+def gauss_newton(rtol=1e-12, atol=1e-9, limit=100, damping=0.0) -> NormalEquationSolver:
     """Full Gauss-Newton steps: fastest near the solution, may diverge far from it."""
+    del damping
     return NormalEquationSolver(
-        rtol, atol, optx.max_norm, optx.NewtonDescent(linear_solver=ArrowCholesky()),
+        rtol, atol, limit, optx.max_norm, optx.NewtonDescent(linear_solver=ArrowCholesky()),
         optx.LearningRate(1.0),
     )  # fmt: skip
 
 
-def levenberg_marquardt(rtol=1e-12, atol: float = 1e-9) -> NormalEquationSolver:
+def levenberg_marquardt(rtol=1e-12, atol=1e-9, limit=100, damping=1e-3) -> NormalEquationSolver:
     """Damped steps with a trust region: the default."""
     return NormalEquationSolver(
-        rtol, atol, optx.max_norm, optx.DampedNewtonDescent(linear_solver=ArrowCholesky()),
-        Relaxing(),
+        rtol, atol, limit, optx.max_norm, optx.DampedNewtonDescent(linear_solver=ArrowCholesky()),
+        Relaxing(damping=damping),
     )  # fmt: skip
 
 

@@ -1,0 +1,139 @@
+"""A recording in memory: the engineer's model and the measurements, names turned into indices."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxvm.recording.model import Model
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Points of targets in images.
+
+    Attributes:
+        epoch: row of the recording's epochs.
+        camera, target: place in the model's cameras and targets.
+        point: place in the target's points.
+        pixel: u, v (px); (0, 0) is the centre of the top-left pixel.
+        sigma: standard deviation of u and of v (px).
+    """
+
+    epoch: Int[np.ndarray, " n"]
+    camera: Int[np.ndarray, " n"]
+    target: Int[np.ndarray, " n"]
+    point: Int[np.ndarray, " n"]
+    pixel: Float[np.ndarray, "n 2"]
+    sigma: Float[np.ndarray, " n"]
+
+
+@dataclass(frozen=True, eq=False)
+class Drivers:
+    """Logged channels, sampled at their own times (s, clock of the epochs)."""
+
+    time: Float[np.ndarray, " samples"]
+    channels: dict[str, Float[np.ndarray, " samples"]]
+
+
+@dataclass(frozen=True, eq=False)
+class Ranges:
+    """Distances (m) from rangefinders to a point, or to the plane z = 0 of a target (point -1)."""
+
+    epoch: Int[np.ndarray, " n"]
+    rangefinder: Int[np.ndarray, " n"]
+    target: Int[np.ndarray, " n"]
+    point: Int[np.ndarray, " n"]
+    distance: Float[np.ndarray, " n"]
+    sigma: Float[np.ndarray, " n"]
+
+
+@dataclass(frozen=True, eq=False)
+class Links:
+    """Relative poses that were measured or calibrated.
+
+    Attributes:
+        from_node, to_node: ("camera" | "station" | "target", place in the model).
+        pose: from_from_to as turn (rad) and shift (m).
+        sigma_rad, sigma_m: standard deviations of each component of turn and shift.
+        epoch: row of the recording's epochs; -1 where the link belongs to none.
+    """
+
+    name: tuple[str, ...]
+    from_node: list[tuple[str, int]]
+    to_node: list[tuple[str, int]]
+    pose: Float[np.ndarray, "n 6"]
+    sigma_rad: Float[np.ndarray, " n"]
+    sigma_m: Float[np.ndarray, " n"]
+    epoch: Int[np.ndarray, " n"]
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """The engineer's model and everything that was measured.
+
+    Attributes:
+        epoch_ids: the epochs' own numbers, as in epochs.csv.
+        time: of the epochs (s), strictly increasing.
+        velocities: by target, velocity of its origin (m/s) and angular rate (rad/s), world axes.
+    """
+
+    model: Model
+    epoch_ids: Int[np.ndarray, " epochs"]
+    time: Float[np.ndarray, " epochs"]
+    velocities: dict[str, Float[np.ndarray, "epochs 6"]]
+    observations: Observations
+    drivers: Drivers | None = None
+    ranges: Ranges | None = None
+    links: Links | None = None
+
+    def select_epochs(self, mask: Bool[np.ndarray, " epochs"]) -> "Recording":
+        """The same recording with the epochs where `mask` is true.
+
+        Drivers keep all their samples. Links of other epochs go, and closures through them.
+
+        Raises:
+            ValueError: the mask is not one boolean for each epoch, or selects none.
+        """
+        mask = np.asarray(mask)
+        if mask.dtype != bool or mask.shape != self.time.shape:
+            raise ValueError(
+                f"the mask has shape {mask.shape} and type {mask.dtype}; "
+                f"it needs one bool for each of the {len(self.time)} epochs"
+            )
+        if not mask.any():
+            raise ValueError("the mask selects no epoch; set at least one entry")
+        row = np.where(mask, np.cumsum(mask) - 1, -1)
+        links, model = self.links, self.model
+        if links is not None:
+            kept = (links.epoch < 0) | mask[np.maximum(links.epoch, 0)]
+            lost = {name for name, keep in zip(links.name, kept, strict=True) if not keep}
+            links = _of_rows(links, kept, row)
+            closures = tuple(
+                c for c in model.closures if not any(name in lost for name, _ in c.links)
+            )
+            model = replace(model, closures=closures)
+        return replace(
+            self,
+            model=model,
+            epoch_ids=self.epoch_ids[mask],
+            time=self.time[mask],
+            observations=_of_rows(self.observations, mask[self.observations.epoch], row),
+            velocities={name: values[mask] for name, values in self.velocities.items()},
+            ranges=None
+            if self.ranges is None
+            else _of_rows(self.ranges, mask[self.ranges.epoch], row),
+            links=links,
+        )
+
+
+def _of_rows(table, kept: np.ndarray, row: np.ndarray):
+    """The kept rows of a table, with epochs renumbered."""
+    parts = {}
+    for name, values in vars(table).items():
+        if isinstance(values, np.ndarray):
+            parts[name] = values[kept]
+        else:
+            parts[name] = type(values)(v for v, keep in zip(values, kept, strict=True) if keep)
+    parts["epoch"] = np.where(parts["epoch"] < 0, -1, row[parts["epoch"]])
+    return type(table)(**parts)
