@@ -405,9 +405,10 @@ def _smallest(ranking: Ranking, variance: float, scene: Scene) -> dict[str, tupl
     sqrt(lambda0 / I) with I the information of one column (MATHEMATICS 1.8); lambda0 from the
     number of hypotheses. Single-term constant hypotheses only; the most favourable place counts.
     """
+    from scipy.stats import norm
+
     from jaxvm.discover.hypotheses import member
     from jaxvm.physics.ports import PORTS
-    from scipy.stats import norm
 
     level = norm.isf(0.025 / max(ranking.n, 1)) + norm.isf(0.2)
     unit = {port.name: port.unit for port in PORTS}

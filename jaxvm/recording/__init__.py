@@ -4,7 +4,15 @@ A recording is a folder with `recording.toml` (cameras, stations, targets, what 
 (`observations`, `epochs`, and if there are any `drivers`, `ranges`, `links`) as csv or parquet.
 """
 
+from jaxvm.recording.datasets import DATASETS, find_data, open_recording
 from jaxvm.recording.errors import RecordingError
+from jaxvm.recording.importers import (
+    board_recording,
+    import_cameramodel,
+    import_corner_table,
+    import_corners_vnl,
+    import_opencv_calibration,
+)
 from jaxvm.recording.model import (
     Camera,
     Closure,
@@ -14,11 +22,14 @@ from jaxvm.recording.model import (
     Station,
     Target,
 )
+from jaxvm.recording.read import read_model, read_recording
 from jaxvm.recording.recording import Drivers, Links, Observations, Ranges, Recording
+from jaxvm.recording.write import model_text, write_recording
 
 __all__ = [
     "Camera",
     "Closure",
+    "DATASETS",
     "Drivers",
     "Links",
     "Model",
@@ -30,4 +41,15 @@ __all__ = [
     "RecordingError",
     "Station",
     "Target",
+    "board_recording",
+    "find_data",
+    "import_cameramodel",
+    "import_corner_table",
+    "import_corners_vnl",
+    "import_opencv_calibration",
+    "model_text",
+    "open_recording",
+    "read_model",
+    "read_recording",
+    "write_recording",
 ]

@@ -7,9 +7,9 @@ from typing import Any, cast
 import numpy as np
 
 from jaxvm.geometry.targets import grid_points
+from jaxvm.physics.drivers import OBSERVATION_DRIVERS
 from jaxvm.physics.effects import Effect, Scope, Term
 from jaxvm.physics.forms import BASES, FORMS
-from jaxvm.physics.drivers import OBSERVATION_DRIVERS
 from jaxvm.physics.ports import PORT_INDEX
 from jaxvm.recording.entries import Entry
 from jaxvm.recording.errors import did_you_mean, has

@@ -74,8 +74,9 @@ class Recording:
 
     Attributes:
         epoch_ids: the epochs' own numbers, as in epochs.csv.
-        time: of the epochs (s), strictly increasing.
+        time: of the epochs (s), strictly increasing; their order where no clock was recorded.
         velocities: by target, velocity of its origin (m/s) and angular rate (rad/s), world axes.
+        timed: whether `time` was recorded; otherwise only the order of the epochs is known.
     """
 
     model: Model
@@ -86,6 +87,7 @@ class Recording:
     drivers: Drivers | None = None
     ranges: Ranges | None = None
     links: Links | None = None
+    timed: bool = True
 
     def select_epochs(self, mask: Bool[np.ndarray, " epochs"]) -> "Recording":
         """The same recording with the epochs where `mask` is true.

@@ -1,0 +1,127 @@
+"""Checks across the tables: units, repeated rows, and whether there is enough of everything."""
+
+import numpy as np
+
+from jaxvm.recording.errors import RecordingError
+from jaxvm.recording.recording import Recording
+from jaxvm.recording.tables import Table
+
+_NUMBERS = {"focal": 2, "centre": 2, "aspect-locked-focal": 1}
+
+
+def check_recording(recording: Recording, table: Table) -> None:
+    """Check a read recording as a whole; `table` is its table of observations.
+
+    Raises:
+        RecordingError: pixels outside the image, an observation twice, a target or camera that is
+            never used, too few points.
+    """
+    _pixels(recording, table)
+    _repeats(recording, table)
+    _unused(recording, table)
+    _too_few(recording, table)
+    _effects(recording)
+
+
+def _pixels(recording: Recording, table: Table) -> None:
+    obs, model = recording.observations, recording.model
+    size = np.array([c.image_size for c in model.cameras], float)
+    for i, camera in enumerate(model.cameras):
+        own = obs.camera == i
+        if own.sum() > 3 and np.abs(obs.pixel[own]).max() <= 2.0:
+            raise table.error(
+                int(np.flatnonzero(own)[0]),
+                f'u and v of camera "{camera.name}" are all below 2, which look like normalised '
+                "coordinates; give pixels",
+            )
+    # Detectors extrapolate a little beyond the border; farther out the size or unit is wrong.
+    margin = 0.05 * size[obs.camera]
+    inside = (obs.pixel > -margin) & (obs.pixel < size[obs.camera] + margin)
+    table.check(
+        inside.all(axis=1),
+        lambda row: f"({obs.pixel[row, 0]:.6g}, {obs.pixel[row, 1]:.6g}) px is outside the image "
+        f'of camera "{model.cameras[obs.camera[row]].name}" '
+        f"({size[obs.camera[row], 0]:g} x {size[obs.camera[row], 1]:g} px); mend it or image_size",
+    )
+
+
+def _repeats(recording: Recording, table: Table) -> None:
+    obs = recording.observations
+    key = np.stack([obs.epoch, obs.camera, obs.target, obs.point], axis=1)
+    _, first, inverse = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    first_of = first[np.ravel(inverse)]
+    table.check(
+        first_of == np.arange(len(key)),
+        lambda row: "this camera has the same point in the same epoch in "
+        f"{table.word} {table.line[first_of[row]]} already; keep one",
+    )
+
+
+def _unused(recording: Recording, table: Table) -> None:
+    obs, model = recording.observations, recording.model
+    ranged = set() if recording.ranges is None else set(recording.ranges.target.tolist())
+    linked = set()
+    if recording.links is not None:
+        linked = {*recording.links.from_node, *recording.links.to_node}
+    for i, target in enumerate(model.targets):
+        if i not in obs.target and i not in ranged and ("target", i) not in linked:
+            raise table.error(
+                None,
+                f'target "{target.name}" is never seen; add its observations or drop '
+                f"[targets.{target.name}] from recording.toml",
+            )
+    for i, camera in enumerate(model.cameras):
+        if i not in obs.camera and ("camera", i) not in linked:
+            raise table.error(
+                None,
+                f'camera "{camera.name}" has no observation; add some or drop '
+                f"[cameras.{camera.name}] from recording.toml",
+            )
+
+
+def _too_few(recording: Recording, table: Table) -> None:
+    """Poses that fewer than three marks must determine, cameras with fewer numbers than unknowns."""
+    obs, model = recording.observations, recording.model
+    if recording.links is None and recording.ranges is None:
+        for i, target in enumerate(model.targets):
+            if "pose" not in target.free:
+                continue
+            own = np.flatnonzero(obs.target == i)
+            moving = target.motion == "per-epoch"
+            epoch = obs.epoch[own] if moving else np.zeros(len(own), int)
+            pairs = np.unique(np.stack([epoch, obs.point[own]], axis=1), axis=0)
+            marks = np.bincount(pairs[:, 0], minlength=int(epoch.max(initial=0)) + 1)
+            scarce = np.flatnonzero((marks > 0) & (marks < 3))
+            if len(scarce):
+                row = own[np.flatnonzero(epoch == scarce[0])[0]]
+                when = f" at epoch {recording.epoch_ids[scarce[0]]}" if moving else ""
+                raise table.error(
+                    int(row),
+                    f'target "{target.name}" shows {marks[scarce[0]]} of its points{when}, '
+                    "but its pose needs at least 3; add points or drop these rows",
+                )
+    for i, camera in enumerate(model.cameras):
+        own = np.flatnonzero(obs.camera == i)
+        width = sum(_NUMBERS.get(name, 0) for name in camera.free)
+        if len(own) and 2 * len(own) < width:
+            raise table.error(
+                int(own[0]),
+                f'camera "{camera.name}" has {len(own)} observations for {width} free numbers; '
+                "add observations or take fewer names into free",
+            )
+
+
+def _effects(recording: Recording) -> None:
+    known = {"constant", "time"} if recording.timed else {"constant"}
+    known |= set() if recording.drivers is None else set(recording.drivers.channels)
+    known |= {
+        f"time since power-on of {c.name}"
+        for c in recording.model.cameras
+        if c.powered_on_s is not None
+    }
+    for effect in recording.model.effects:
+        if effect.driver not in known:
+            raise RecordingError(
+                f'recording.toml: effect "{effect.name}" depends on "{effect.driver}", which is '
+                f"not recorded (there is: {', '.join(sorted(known))}); add it to the drivers"
+            )

@@ -1,0 +1,296 @@
+"""Read and check a recording: whatever is wrong is said with file, line and mend."""
+
+import tomllib
+from pathlib import Path
+
+import numpy as np
+
+from jaxvm.recording.check import check_recording
+from jaxvm.recording.errors import RecordingError, did_you_mean, has
+from jaxvm.recording.model import Model
+from jaxvm.recording.parse import known_link, parse_model
+from jaxvm.recording.recording import Drivers, Links, Observations, Ranges, Recording
+from jaxvm.recording.tables import Table, read_table
+from jaxvm.recording.write import RATES
+
+_POSE = ("turn_x", "turn_y", "turn_z", "shift_x", "shift_y", "shift_z")
+
+
+def read_recording(folder: str | Path, model: str | Path | None = None) -> Recording:
+    """Read a recording from its folder.
+
+    Args:
+        folder: with recording.toml and the tables.
+        model: another file in the form of recording.toml to take instead of the folder's, such as
+            the model.toml of an earlier diagnosis.
+
+    Raises:
+        RecordingError: anything is missing, unknown, impossible or out of order; one sentence that
+            names the file, the line and the mend.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise RecordingError(f"{folder}: there is no such folder; give the folder of a recording")
+    file = folder / "recording.toml" if model is None else Path(model)
+    parsed, text = read_model(file)
+    epochs = _required(folder, "epochs")
+    ids, time, timed, velocities = _epochs(epochs, parsed)
+    recording = Recording(
+        model=parsed,
+        epoch_ids=ids,
+        time=time,
+        velocities=velocities,
+        observations=_observations(observed := _required(folder, "observations"), parsed, ids),
+        drivers=_drivers(read_table(folder, "drivers", False), parsed, time, timed),
+        ranges=_ranges(read_table(folder, "ranges", False), parsed, ids),
+        links=_links(read_table(folder, "links", False), parsed, ids),
+        timed=timed,
+    )
+    names = () if recording.links is None else recording.links.name
+    known_link(text, parsed, list(names))
+    check_recording(recording, observed)
+    return recording
+
+
+def read_model(file: str | Path) -> tuple[Model, str]:
+    """The engineer's model in a file like recording.toml, and the text of the file.
+
+    Raises:
+        RecordingError: the file is absent, not TOML, or something in it is wrong.
+    """
+    file = Path(file)
+    if not file.is_file():
+        raise RecordingError(
+            f"{file.name}: there is no such file in {file.parent}; write one with the cameras and "
+            "targets (the README shows an example)"
+        )
+    try:
+        text = file.read_text(encoding="utf-8")
+        table = tomllib.loads(text)
+    except UnicodeDecodeError:
+        raise RecordingError(f"{file.name}: it is not a text in UTF-8; save it as one") from None
+    except tomllib.TOMLDecodeError as problem:
+        raise RecordingError(f"{file.name}: this is not valid TOML: {problem}; mend it") from None
+    try:
+        return parse_model(table, text), text
+    except RecordingError as problem:
+        raise RecordingError(str(problem).replace("recording.toml", file.name, 1)) from None
+
+
+def _required(folder: Path, name: str) -> Table:
+    table = read_table(folder, name, True)
+    assert table is not None
+    if len(table) == 0:
+        raise table.error(None, "there is no row below the header; add the measurements")
+    return table
+
+
+def _epochs(table: Table, model: Model):
+    rates = {f"{t.name}.{rate}": (t.name, k) for t in model.targets for k, rate in enumerate(RATES)}
+    table.needs(("epoch",), ("t", *rates))
+    ids = table.whole("epoch", "a whole number")
+    table.check(
+        np.array([np.flatnonzero(ids == e)[0] == i for i, e in enumerate(ids)]),
+        lambda row: f"epoch {ids[row]} is there twice; number every epoch once",
+    )
+    timed = "t" in table.frame
+    if timed:
+        time = table.numbers("t", "a time in seconds")
+        later = np.append(True, np.diff(time) > 0.0)
+        table.check(
+            later,
+            lambda row: f"t = {time[row]:.12g} s is not after {time[row - 1]:.12g} s; "
+            "sort the epochs by time, each with a time of its own",
+        )
+        if len(time) > 1 and np.median(np.diff(time)) > 3e5 and time[0] > 1e10:
+            raise table.error(
+                0, f"t = {time[0]:.12g} looks like milliseconds since 1970; give seconds"
+            )
+    else:
+        time = np.arange(len(ids), dtype=float)
+    velocities = {}
+    for target in model.targets:
+        given = [f"{target.name}.{r}" for r in RATES if f"{target.name}.{r}" in table.frame]
+        if not given:
+            continue
+        if len(given) < 6:
+            missing = next(r for r in RATES if f"{target.name}.{r}" not in given)
+            raise table.error(
+                None,
+                f'column "{target.name}.{missing}" is missing; a velocity has all of '
+                f"{', '.join(RATES)} (m/s and rad/s)",
+            )
+        columns = [table.numbers(name, "a velocity in m/s or rad/s") for name in given]
+        velocities[target.name] = np.stack(columns, axis=1)
+    return ids, time, timed, velocities
+
+
+def _epoch_rows(table: Table, ids: np.ndarray) -> np.ndarray:
+    epoch = table.whole("epoch", "the number of an epoch")
+    place = {number: row for row, number in enumerate(ids.tolist())}
+    rows = np.array([place.get(number, -1) for number in epoch.tolist()], int)
+    table.check(
+        rows >= 0,
+        lambda row: f"epoch {epoch[row]} is not in the epochs ({ids[0]} to {ids[-1]}); "
+        "add it there or drop the row",
+    )
+    return rows
+
+
+def _point_rows(table: Table, model: Model, target: np.ndarray, plane: bool) -> np.ndarray:
+    known = [{name: i for i, name in enumerate(t.point_names)} for t in model.targets]
+    names = table.texts("point")
+    point = np.array(
+        [
+            -1 if plane and name == "" else known[t].get(name, -2)
+            for t, name in zip(target.tolist(), names, strict=True)
+        ],
+        int,
+    )
+    table.check(
+        point > -2,
+        lambda row: f'point "{names[row]}" is not on target '
+        f'"{model.targets[target[row]].name}" {has(known[target[row]])}; '
+        f"{did_you_mean(names[row], known[target[row]])}",
+    )
+    return point
+
+
+def _sigma(table: Table, default: float, unit: str) -> np.ndarray:
+    if "sigma" not in table.frame:
+        return np.full(len(table), default)
+    sigma = table.numbers("sigma", f"a standard deviation in {unit}")
+    table.check(
+        sigma > 0.0,
+        lambda row: f"sigma is {sigma[row]:g}; it must be above 0 ({unit}), "
+        "drop the row if the measurement is no good",
+    )
+    return sigma
+
+
+def _observations(table: Table, model: Model, ids: np.ndarray) -> Observations:
+    table.needs(("epoch", "camera", "target", "point", "u", "v"), ("sigma",))
+    epoch = _epoch_rows(table, ids)
+    camera = table.places("camera", [c.name for c in model.cameras], "recording.toml")
+    target = table.places("target", [t.name for t in model.targets], "recording.toml")
+    point = _point_rows(table, model, target, plane=False)
+    pixel = np.stack([table.numbers(c, "a number of px") for c in ("u", "v")], axis=1)
+    return Observations(epoch, camera, target, point, pixel, _sigma(table, model.pixel_sigma, "px"))
+
+
+def _drivers(table: Table | None, model: Model, time: np.ndarray, timed: bool) -> Drivers | None:
+    if table is None or len(table) == 0:
+        if model.drivers:
+            name = next(iter(model.drivers))
+            raise RecordingError(
+                f'drivers.csv: recording.toml describes the driver "{name}", but there are no '
+                "drivers; add the file or drop the description"
+            )
+        return None
+    table.needs(("t",), tuple(table.frame.columns))
+    if not timed:
+        raise table.error(None, "there are drivers, but epochs have no times; add t to the epochs")
+    t = table.numbers("t", "a time in seconds")
+    table.check(
+        np.append(True, np.diff(t) > 0.0),
+        lambda row: f"t = {t[row]:.12g} s is not after {t[row - 1]:.12g} s; sort by time",
+    )
+    channels = {
+        str(name): table.numbers(name, f"a reading of {name}")
+        for name in table.frame.columns
+        if name != "t"
+    }
+    for name in model.drivers:
+        if name not in channels:
+            raise table.error(
+                None,
+                f'column "{name}" is missing, which recording.toml describes {has(channels)}; '
+                f"{did_you_mean(name, channels)}",
+            )
+    for name in ("constant", "time"):
+        if name in channels:
+            raise table.error(None, f'a driver can\'t be called "{name}"; rename the column')
+    for name, values in channels.items():
+        if name.lower().endswith("degc"):
+            table.check(
+                (values > -80.0) & (values < 150.0),
+                lambda row, v=values, n=name: f"{n} is {v[row]:g}, which is no temperature in "
+                f"degrees Celsius{' (kelvin?)' if v[row] > 200 else ''}; convert the column",
+            )
+    spacing = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
+    if time[0] < t[0] - spacing or time[-1] > t[-1] + spacing:
+        raise table.error(
+            0 if time[0] < t[0] - spacing else len(t) - 1,
+            f"drivers run from {t[0]:.6g} s to {t[-1]:.6g} s, epochs from {time[0]:.6g} s to "
+            f"{time[-1]:.6g} s; both need one clock, and drivers for the whole time",
+        )
+    return Drivers(t, channels)
+
+
+def _ranges(table: Table | None, model: Model, ids: np.ndarray) -> Ranges | None:
+    if table is None or len(table) == 0:
+        return None
+    table.needs(("epoch", "rangefinder", "target", "point", "range_m"), ("sigma",))
+    epoch = _epoch_rows(table, ids)
+    finder = table.places("rangefinder", [r.name for r in model.rangefinders], "recording.toml")
+    target = table.places("target", [t.name for t in model.targets], "recording.toml")
+    point = _point_rows(table, model, target, plane=True)
+    distance = table.numbers("range_m", "a distance in m")
+    table.check(
+        (distance > 0.0) & (distance < 5000.0),
+        lambda row: f"range_m is {distance[row]:g}"
+        + ("; a distance is above 0" if distance[row] <= 0 else ", which looks like mm; give m"),
+    )
+    return Ranges(epoch, finder, target, point, distance, _sigma(table, model.range_sigma, "m"))
+
+
+def _links(table: Table | None, model: Model, ids: np.ndarray) -> Links | None:
+    if table is None or len(table) == 0:
+        return None
+    table.needs(("link", "from", "to", *_POSE, "sigma_rad", "sigma_m"), ("epoch",))
+    bodies = {
+        "camera": [c.name for c in model.cameras],
+        "station": [s.name for s in model.stations],
+        "target": [t.name for t in model.targets],
+    }
+    nodes = {}
+    for column in ("from", "to"):
+        nodes[column] = []
+        for row, text in enumerate(table.texts(column)):
+            kind, _, name = text.partition(":")
+            if kind not in bodies:
+                raise table.error(
+                    row, f'{column} is "{text}"; write camera:NAME, station:NAME or target:NAME'
+                )
+            if name not in bodies[kind]:
+                raise table.error(
+                    row,
+                    f'{column}: there is no {kind} "{name}" {has(bodies[kind])}; '
+                    f"{did_you_mean(name, bodies[kind])}",
+                )
+            nodes[column].append((kind, bodies[kind].index(name)))
+    sigmas = {}
+    for column, unit in (("sigma_rad", "rad"), ("sigma_m", "m")):
+        sigmas[column] = table.numbers(column, f"a standard deviation in {unit}")
+        table.check(
+            sigmas[column] > 0.0,
+            lambda row, c=column: f"{c} is {sigmas[c][row]:g}; it must be above 0",
+        )
+    pose = np.stack([table.numbers(c, "a number (rad or m)") for c in _POSE], axis=1)
+    turn = np.linalg.norm(pose[:, :3], axis=1)
+    table.check(
+        turn <= 2.0 * np.pi,
+        lambda row: f"the turn has length {turn[row]:.4g}, more than 2 pi; give rad, not degrees",
+    )
+    epoch = np.full(len(table), -1)
+    if "epoch" in table.frame:
+        texts = table.texts("epoch")
+        dated = np.array([text not in ("", "nan", "None") for text in texts])
+        if dated.any():
+            rows = np.flatnonzero(dated)
+            part = Table(table.file, table.frame[dated], table.line[dated], table.word)
+            epoch[rows] = _epoch_rows(part, ids)
+    return Links(
+        tuple(table.texts("link")), nodes["from"], nodes["to"], pose,
+        sigmas["sigma_rad"], sigmas["sigma_m"], epoch,
+    )  # fmt: skip
