@@ -28,9 +28,22 @@ def random_vectors(n=N):
     return np.hstack([angle[:, None] * axis, RNG.normal(0.0, 3.0, (n, 3))])
 
 
-A, B, C = (jax.vmap(pose_from_vector)(random_vectors()) for _ in range(3))
-# Another order, so that small turns meet large ones.
-B = jax.tree.map(lambda x: x[RNG.permutation(N)], jax.vmap(pose_from_vector)(random_vectors()))
+def batched(function):
+    """Of many at once, compiled."""
+    return jax.jit(jax.vmap(function))
+
+
+poses_from_vectors = batched(pose_from_vector)
+exp_all = batched(se3_exp)
+exp_then_log = batched(lambda t: se3_log(se3_exp(t)))
+A = poses_from_vectors(random_vectors())
+B = poses_from_vectors(RNG.permutation(random_vectors()))  # small turns meet large ones
+
+
+def with_no_turn(twists):
+    """The same number of twists, the first two of them at rest and without turn."""
+    twists[:2] = [[0, 0, 0, 0, 0, 0], [0, 0, 0, 1, 2, 3]]
+    return twists
 
 
 def matrices(poses: Pose) -> np.ndarray:
@@ -49,13 +62,13 @@ def twist_matrices(twists: np.ndarray) -> np.ndarray:
 
 
 def test_composition_inverse_and_application_are_those_of_4x4_matrices():
-    ab = jax.vmap(lambda a, b: a @ b)(A, B)
+    ab = batched(lambda a, b: a @ b)(A, B)
     np.testing.assert_allclose(matrices(ab), matrices(A) @ matrices(B), atol=1e-14)
-    inverse = jax.vmap(Pose.inverse)(A)
+    inverse = batched(Pose.inverse)(A)
     np.testing.assert_allclose(matrices(inverse), np.linalg.inv(matrices(A)), atol=1e-13)
     points = RNG.normal(size=(N, 3))
     expected = np.einsum("nij,nj->ni", matrices(A), np.hstack([points, np.ones((N, 1))]))[:, :3]
-    np.testing.assert_allclose(jax.vmap(Pose.apply)(A, points), expected, atol=1e-14)
+    np.testing.assert_allclose(batched(Pose.apply)(A, points), expected, atol=1e-14)
 
 
 def test_identity_maps_every_point_to_itself():
@@ -76,47 +89,48 @@ def test_names_compose_from_right_to_left():
 
 def test_vector_and_pose_round_trip():
     vectors = random_vectors()
-    poses = jax.vmap(pose_from_vector)(vectors)
+    poses = poses_from_vectors(vectors)
     np.testing.assert_allclose(
         poses.rotation, Rotation.from_rotvec(vectors[:, :3]).as_matrix(), atol=1e-14
     )
     # The translation is taken as it is and is not turned.
     assert np.array_equal(poses.shift, vectors[:, 3:])
-    np.testing.assert_allclose(jax.vmap(vector_from_pose)(poses), vectors, rtol=1e-13, atol=1e-14)
+    np.testing.assert_allclose(batched(vector_from_pose)(poses), vectors, rtol=1e-13, atol=1e-14)
 
 
 def test_se3_exp_equals_the_matrix_exponential():
-    twists = np.concatenate([random_vectors(), np.zeros((1, 6)), [[0, 0, 0, 1, 2, 3]]])
+    twists = with_no_turn(random_vectors())
     expected = np.array([expm(m) for m in twist_matrices(twists)])
-    np.testing.assert_allclose(matrices(jax.vmap(se3_exp)(twists)), expected, atol=1e-13)
+    np.testing.assert_allclose(matrices(exp_all(twists)), expected, atol=1e-13)
 
 
 def test_se3_log_undoes_exp():
-    twists = np.concatenate([random_vectors(), np.zeros((1, 6)), [[0, 0, 0, 1, 2, 3]]])
-    got = jax.vmap(lambda t: se3_log(se3_exp(t)))(twists)
+    twists = with_no_turn(random_vectors())
+    got = exp_then_log(twists)
     np.testing.assert_allclose(got, twists, rtol=1e-12, atol=1e-13)
 
 
 def test_derivatives_at_the_identity():
     """exp has the unit twists as derivative at 0, and log after exp the identity."""
-    zero = jnp.zeros(6)
-    shift = jax.jacrev(lambda t: se3_exp(t).shift)(zero)
-    np.testing.assert_allclose(shift, np.eye(3, 6, 3), atol=1e-15)
-    there_and_back = jax.jacrev(lambda t: se3_log(se3_exp(t)))(zero)
+
+    def both(twist):
+        pose = se3_exp(twist)
+        return pose.shift, se3_log(pose)
+
+    of_shift, there_and_back = jax.jit(jax.jacrev(both))(jnp.zeros(6))
+    np.testing.assert_allclose(of_shift, np.eye(3, 6, 3), atol=1e-15)
     np.testing.assert_allclose(there_and_back, np.eye(6), atol=1e-15)
 
 
 def test_adjoint_moves_a_twist_through_a_pose():
     """pose exp(xi) pose^-1 = exp(Ad xi), and Ad of a product is the product."""
     xi = 0.4 * RNG.normal(size=(N, 6))
-    left = jax.vmap(lambda p, x: p @ se3_exp(x) @ p.inverse())(A, xi)
-    adjoint = jax.vmap(se3_adjoint)(A)
-    right = jax.vmap(se3_exp)(jnp.einsum("nij,nj->ni", adjoint, xi))
+    left = batched(lambda p, x: p @ se3_exp(x) @ p.inverse())(A, xi)
+    adjoint = batched(se3_adjoint)(A)
+    right = exp_all(jnp.einsum("nij,nj->ni", adjoint, xi))
     np.testing.assert_allclose(matrices(left), matrices(right), atol=1e-12)
-    product = jax.vmap(lambda a, b: se3_adjoint(a @ b))(A, B)
-    np.testing.assert_allclose(
-        product, np.asarray(adjoint) @ np.asarray(jax.vmap(se3_adjoint)(B)), atol=1e-12
-    )
+    of_product, of_b = batched(lambda a, b: (se3_adjoint(a @ b), se3_adjoint(b)))(A, B)
+    np.testing.assert_allclose(of_product, adjoint @ of_b, atol=1e-12)
 
 
 def test_shift_of_a_twist_is_the_left_jacobian_times_rho():

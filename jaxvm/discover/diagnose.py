@@ -49,8 +49,9 @@ class Finding:
 
     Attributes:
         hypothesis: what it is.
-        effect: with amplitudes and constants from all epochs.
+        effect: with amplitudes and constants as they were found, in the fitted epochs.
         stds: standard deviations of the amplitudes, then of the constants.
+        final_effect, final_stds: the same from all epochs, together with all later findings.
         weight: posterior weight among its doubles.
         rivals: hypotheses that this recording can't tell from it.
         p_value: family-wise.
@@ -63,6 +64,8 @@ class Finding:
     hypothesis: Hypothesis
     effect: Effect
     stds: tuple[float, ...]
+    final_effect: Effect
+    final_stds: tuple[float, ...]
     weight: float
     rivals: tuple[Rival, ...]
     p_value: float
@@ -140,7 +143,7 @@ class _Fits:
 
 def diagnose(
     recording: Recording,
-    effects: tuple[Effect, ...] = (),
+    effects: tuple[Effect, ...] | None = None,
     every: int = 3,
     alpha: float = ALPHA,
     max_findings: int = 8,
@@ -151,7 +154,7 @@ def diagnose(
 
     Args:
         recording: measurements and the engineer's model.
-        effects: physics already in the model.
+        effects: physics already in the model, instead of what the recording's model has.
         every: every n-th epoch is held out.
         alpha: family-wise probability of a false claim.
         max_findings: bound on the number of findings.
@@ -164,7 +167,8 @@ def diagnose(
     """
     began = time.perf_counter()
     progress("start values from the data")
-    scene = start(build(recording))
+    effects = recording.model.effects if effects is None else effects
+    scene = start(build(recording, ()))
     scene = scene.with_effects(effects, _room(effects))
     held = hold_out(scene, every)
     everything = tuple(np.ones(len(rows)) for rows in scene.tables)
@@ -206,7 +210,9 @@ def diagnose(
             Finding(
                 hypothesis=chosen.hypothesis,
                 effect=chosen.effect,
-                stds=(),
+                stds=_deviations(chosen.adjustment)[-1],
+                final_effect=chosen.effect,
+                final_stds=(),
                 weight=weight,
                 rivals=tuple(doubles[:8]),
                 p_value=p_value,
@@ -328,9 +334,8 @@ def _common_evidence(candidate: Candidate, all_candidates, current: Adjustment, 
 def _prune(current: Adjustment, findings: list[Finding], split: _Fits, n: int):
     """Drop an earlier finding that the later ones made superfluous (Wald test against BIC)."""
     given = len(current.scene.effects) - len(findings)
-    amplitude = current.scene.network.layout.all("amplitude")
     ends = np.cumsum([effect.n_columns for effect in current.scene.effects])
-    groups = [amplitude[end - e.n_columns : end]
+    groups = [np.arange(end - e.n_columns, end)
               for e, end in zip(current.scene.effects, ends, strict=True)]  # fmt: skip
     drops = wald_drops(current, groups[given:])
     for k, (finding, drop) in enumerate(zip(findings[:-1], drops, strict=False)):
@@ -345,19 +350,21 @@ def _prune(current: Adjustment, findings: list[Finding], split: _Fits, n: int):
 
 
 def _with_final_values(final: Adjustment, findings: list[Finding], given: int) -> list[Finding]:
-    """Findings with amplitudes, constants and deviations from the fit to all epochs."""
-    deviations = standard_deviations(final, robust_variance(final))
+    """Findings with the values of the fit to all epochs."""
+    values = zip(final.scene.fitted_effects(), _deviations(final), strict=True)
+    pairs = zip(findings, list(values)[given:], strict=True)
+    return [replace(f, final_effect=effect, final_stds=stds) for f, (effect, stds) in pairs]
+
+
+def _deviations(adjustment: Adjustment) -> list[tuple[float, ...]]:
+    """Standard deviations of every effect: its amplitudes, then its constants."""
+    deviations = standard_deviations(adjustment, robust_variance(adjustment))
     amplitude, constant = np.asarray(deviations.amplitude), np.asarray(deviations.constant)
-    fitted = final.scene.fitted_effects()
-    column = sum(e.n_columns for e in fitted[:given])
-    first = sum(len(e.constants) for e in fitted[:given])
-    result = []
-    for finding, effect in zip(findings, fitted[given:], strict=True):
+    result, column, first = [], 0, 0
+    for effect in adjustment.scene.effects:
         n, m = effect.n_columns, len(effect.constants)
-        stds = (*amplitude[column : column + n], *constant[first : first + m])
-        result.append(
-            Finding(**{**vars(finding), "effect": effect, "stds": tuple(map(float, stds))})
-        )
+        own = (*amplitude[column : column + n], *constant[first : first + m])
+        result.append(tuple(map(float, own)))
         column, first = column + n, first + m
     return result
 

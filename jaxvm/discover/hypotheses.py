@@ -186,7 +186,8 @@ def member(family: Family, index: tuple[int, int, int], scene: Scene) -> Hypothe
 def driver_kind(scene: Scene, driver: str) -> str:
     """Kind of a time-like driver: "constant", "quantity", "time" or "power-on"."""
     channels = scene.network.channels
-    return channels.kinds[channels.index(driver)]
+    kind = channels.kinds[channels.index(driver)]
+    return "time" if kind == "order" else kind
 
 
 def _family(groups, courses, scopes) -> Family:

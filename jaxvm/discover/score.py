@@ -38,8 +38,8 @@ from jaxvm.physics.drivers import pattern
 from jaxvm.physics.forms import BASIS_INDEX, FORMS, evaluate_basis
 from jaxvm.physics.ports import PORT_INDEX
 from jaxvm.solve.adjust import Adjustment
-from jaxvm.solve.arrow import factorise
-from jaxvm.solve.problem import Problem
+from jaxvm.solve.arrow import Arrow, factorise
+from jaxvm.solve.problem import Problem, normal_at
 from jaxvm.solve.reduced import half_rows, packet_of_rows
 
 FEWEST_EPOCHS = 3.0
@@ -133,9 +133,9 @@ class Ranking:
 
 
 @eqx.filter_jit
-def _whitened(problem: Problem, x):
+def _whitened(problem: Problem, x, hessian: Arrow):
     """Half rows, residuals and port tangents of all tables on which effects act."""
-    factors = factorise(problem.normal(x).hessian)
+    factors = factorise(hessian)
     flat = problem.flat(x)
     state = problem.network.layout.restore(flat)
     residuals = jax.tree.leaves(problem.residual(x))
@@ -152,7 +152,7 @@ def _whitened(problem: Problem, x):
 def arrange(adjustment: Adjustment) -> Arrangement:
     """Arrange residuals and tangents of an adjusted scene in cells."""
     scene, problem = adjustment.scene, adjustment.problem
-    whitened = _whitened(problem, adjustment.x)
+    whitened = _whitened(problem, adjustment.x, normal_at(problem, adjustment.x).hessian)
     n_groups = problem.sizes[1]
     keys, drivers, halves, residuals, tangents, starts = [], [], [], [], [], []
     components = max(r.shape[1] for _, r, _ in whitened)

@@ -85,7 +85,10 @@ class BrownConrady(LensFamily):
 
     def undistort(self, coefficients, image_point):
         tangent = _invert(lambda t: self._plane(coefficients, t), image_point)
-        return jnp.append(tangent, 1.0)
+        # Beyond the edge of the image circle the polynomial folds back; no ray is imaged there.
+        slope = jax.jacfwd(lambda t: self._plane(coefficients, t))(jax.lax.stop_gradient(tangent))
+        seen = (jnp.linalg.det(slope) > 0.0) & (jnp.trace(slope) > 0.0)
+        return jnp.append(jnp.where(seen, tangent, jnp.nan), 1.0)
 
 
 class KannalaBrandt(LensFamily):
@@ -111,7 +114,7 @@ class KannalaBrandt(LensFamily):
         rho = jnp.sqrt(jnp.where(off_axis, square, 1.0))
         theta = jnp.arctan2(rho, ray[2])
         # On the axis theta_d / rho is 1 / z, and smooth.
-        axis_depth = jnp.where(off_axis, 1.0, ray[2])
+        axis_depth = jnp.where(off_axis, 1.0, jnp.where(ray[2] > 0.0, ray[2], jnp.nan))
         scale = jnp.where(off_axis, self._angle(k, theta) / rho, 1.0 / axis_depth)
         point = scale * ray[:2]
         if extra is None:
@@ -127,6 +130,7 @@ class KannalaBrandt(LensFamily):
         off_axis = square > 0.0
         radius = jnp.sqrt(jnp.where(off_axis, square, 1.0))
         theta = _invert(lambda t: self._angle(coefficients, t), jnp.where(off_axis, radius, 0.0))
+        theta = jnp.where((theta >= 0.0) & (theta <= jnp.pi), theta, jnp.nan)
         direction = image_point / radius
         ray = jnp.append(jnp.sin(theta) * direction, jnp.cos(theta))
         axis = jnp.append(image_point, 1.0)

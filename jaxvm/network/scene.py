@@ -98,9 +98,13 @@ class Scene:
         return tuple(result)
 
 
-def build(recording: Recording, effects: tuple[Effect, ...] = ()) -> Scene:
-    """Scene of a recording, at the values that its model gives (nothing estimated yet)."""
+def build(recording: Recording, effects: tuple[Effect, ...] | None = None) -> Scene:
+    """Scene of a recording, at the values that its model gives (nothing estimated yet).
+
+    `effects` replace those that the model itself has.
+    """
     model = recording.model
+    effects = model.effects if effects is None else effects
     n_epochs = len(recording.time)
     station_row = _pose_rows([s.motion for s in model.stations], n_epochs)
     target_row = _pose_rows([t.motion for t in model.targets], n_epochs)
@@ -113,6 +117,7 @@ def build(recording: Recording, effects: tuple[Effect, ...] = ()) -> Scene:
         {} if recording.drivers is None else recording.drivers.channels,
         None if recording.drivers is None else recording.drivers.time,
         {c.name: c.powered_on_s for c in model.cameras if c.powered_on_s is not None},
+        recording.timed,
     )
     empty, _, _ = tabulate((), channels, 0, 1)
     nothing = np.zeros(0, int)
@@ -593,7 +598,7 @@ def _with_amplitude_priors(scene: Scene, network: Network) -> Network:
     tables = [*network.pixels, *([] if network.ranges is None else [network.ranges])]
     for factor in tables:
         reach = np.maximum(reach, np.abs(np.asarray(factor.pattern)).max(axis=0, initial=0.0))
-    own = np.asarray(courses(network.effects, scene.state.constant, network.channels))
+    own = np.asarray(_courses(network.effects, scene.state.constant, network.channels))
     reach = reach * np.abs(own).max(axis=1)
     largest = np.abs(np.asarray(network.effects.ports)).T > 0
     limit = np.where(largest, np.array([port.largest for port in PORTS])[:, None], 0.0).max(axis=0)
@@ -608,8 +613,11 @@ def _with_amplitude_priors(scene: Scene, network: Network) -> Network:
     )
     if given is None:
         return replace(network, priors=own_priors)
-    both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), given, own_priors)
+    both = jax.tree.map(lambda a, b: jnp.asarray(np.concatenate([a, b])), given, own_priors)
     return replace(network, priors=both)
+
+
+_courses = eqx.filter_jit(courses)
 
 
 def observation_driver_table(scene: Scene, factor: PixelFactor, rows: np.ndarray):

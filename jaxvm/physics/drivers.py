@@ -123,16 +123,23 @@ def build_channels(
     recorded: dict[str, Float[np.ndarray, " times"]],
     recorded_time: Float[np.ndarray, " times"] | None,
     power_on: dict[str, float],
+    timed: bool = True,
 ) -> Channels:
     """Channels of a recording: its own, time (s since the first epoch), time since power-on.
 
-    `power_on` maps a camera to its moment of power-on on the recording's clock (s).
+    `power_on` maps a camera to its moment of power-on on the recording's clock (s). Where only the
+    order of the epochs is known (not `timed`), there is "order" in place of "time".
     """
     grid = epoch_time if recorded_time is None else recorded_time
+    if len(grid) == 1:
+        # Forms with a memory need two samples; nothing changes between them.
+        grid = grid[0] + np.array([0.0, 1.0])
+        recorded = {name: np.repeat(values, 2) for name, values in recorded.items()}
     rows: dict[str, tuple[str, np.ndarray]] = {"constant": ("constant", np.ones_like(grid))}
     rows |= {name: ("quantity", np.asarray(values)) for name, values in recorded.items()}
     if len(epoch_time) > 1:
-        rows["time"] = ("time", grid - epoch_time[0])
+        name = "time" if timed else "order"
+        rows[name] = (name, grid - epoch_time[0])
     rows |= {
         f"time since power-on of {camera}": ("power-on", grid - moment)
         for camera, moment in power_on.items()

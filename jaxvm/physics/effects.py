@@ -124,7 +124,7 @@ class Channels(eqx.Module):
         time: grid (s).
         values: one row a channel.
         epoch_time: time of each epoch (s).
-        kinds: for each channel "constant", "quantity", "time" or "power-on".
+        kinds: for each channel "constant", "quantity", "time", "order" or "power-on".
     """
 
     time: Float[Array, " times"]
@@ -184,6 +184,7 @@ def tabulate(
         own = [first_constant + k for k in range(len(effect.constants))]
         constants[own] = effect.constants
         given = effect.amplitudes or (0.0,) * effect.n_columns
+        start = column
         for term in effect.terms:
             for name in form.bases:
                 ports[column, PORT_INDEX[term.port]] = term.weight
@@ -191,16 +192,11 @@ def tabulate(
                 basis[column] = BASIS_INDEX[name]
                 reference[column] = effect.reference if form.centred else 0.0
                 constant_index[column, : len(own)] = own
-                amplitudes[column] = given[column - _start(effects, effect)]
+                amplitudes[column] = given[column - start]
                 column += 1
         first_constant += len(own)
     table = EffectTable(*map(jnp.asarray, (ports, channel, basis, reference, constant_index)))
     return table, amplitudes, constants
-
-
-def _start(effects: tuple[Effect, ...], effect: Effect) -> int:
-    before = effects[: next(i for i, e in enumerate(effects) if e is effect)]
-    return sum(e.n_columns for e in before)
 
 
 def capacity(effects: tuple[Effect, ...]) -> tuple[int, int]:

@@ -83,6 +83,8 @@ BASES: dict[str, Callable[[Course, Course, Constants], Course]] = {
 }
 """All bases by name. Those that use `t` remember the past and apply to time courses only."""
 
+_PLACED = ("step", "ramp", "bump", "play")
+
 BASIS_INDEX = {name: index for index, name in enumerate(BASES)}
 
 
@@ -90,7 +92,12 @@ def evaluate_basis(
     basis: Int[Array, ""], x: Course, t: Course, constants: Constants
 ) -> Float[Array, " times"]:
     """Course of the basis with number `basis`; the number is data, so nothing is recompiled."""
-    return jnp.stack([function(x, t, constants) for function in BASES.values()])[basis]
+    # Bases that are computed along and thrown away must not divide by an instant at zero, and an
+    # optimiser that steps to a negative time constant meets the limit of a very short one.
+    positive = jnp.maximum(constants, 1e-9)
+    return jnp.stack(
+        [f(x, t, constants if name in _PLACED else positive) for name, f in BASES.items()]
+    )[basis]
 
 
 @dataclass(frozen=True)

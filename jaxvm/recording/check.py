@@ -112,7 +112,7 @@ def _too_few(recording: Recording, table: Table) -> None:
 
 
 def _effects(recording: Recording) -> None:
-    known = {"constant", "time"} if recording.timed else {"constant"}
+    known = {"constant", "time" if recording.timed else "order"}
     known |= set() if recording.drivers is None else set(recording.drivers.channels)
     known |= {
         f"time since power-on of {c.name}"

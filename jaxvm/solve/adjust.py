@@ -14,7 +14,7 @@ from jaxvm.network.scene import Scene
 from jaxvm.solve.compiling import compile_seconds
 from jaxvm.solve.gauge import check_gauge
 from jaxvm.solve.optimise import METHODS
-from jaxvm.solve.problem import Normal, Problem, normal_at_start, scaled, scene_problem
+from jaxvm.solve.problem import Normal, Problem, normal_at, scaled, scene_problem
 from jaxvm.solve.robust import Loss
 
 
@@ -124,7 +124,7 @@ def adjust(
         )
     if active is not None:
         problem = eqx.tree_at(lambda p: p.active, problem, problem.active & jnp.asarray(active))
-    problem, normal = scaled(problem, normal_at_start(problem))
+    problem, normal = scaled(problem, normal_at(problem, jnp.zeros(problem.n)))
     if check:
         check_gauge(normal, scene.unknowns)
     solver = METHODS[method](

@@ -15,8 +15,8 @@ from jaxtyping import Array, Float
 
 from jaxvm.network.state import State
 from jaxvm.solve.adjust import Adjustment
-from jaxvm.solve.arrow import factorise
-from jaxvm.solve.problem import Problem
+from jaxvm.solve.arrow import ArrowFactors, factorise
+from jaxvm.solve.problem import Problem, normal_at
 
 
 def covariance(
@@ -29,54 +29,61 @@ def covariance(
     `quantity` must be differentiable; it may combine any fields of the state, such as the pose of
     one target relative to another.
     """
-    return scale * _covariance(adjustment.problem, adjustment.x, quantity)
+    return scale * _covariance(adjustment.problem, adjustment.x, _factors(adjustment), quantity)
+
+
+def _factors(adjustment: Adjustment) -> ArrowFactors:
+    """The factorised normal matrix at the solution."""
+    return _factorised(normal_at(adjustment.problem, adjustment.x).hessian)
+
+
+_factorised = eqx.filter_jit(factorise)
 
 
 @eqx.filter_jit
-def _covariance(problem: Problem, x, quantity):
-    factors = factorise(problem.normal(x).hessian)
+def _covariance(problem: Problem, x, factors: ArrowFactors, quantity):
     rows = jax.jacrev(lambda y: jnp.ravel(quantity(problem.state(y))))(x)
     return rows @ factors.solve(rows.T)
 
 
-def wald_drops(
-    adjustment: Adjustment, groups: list[np.ndarray]
-) -> list[float]:
-    """How much chi-square would rise if groups of parameters were held at zero: a^T C^-1 a.
+def wald_drops(adjustment: Adjustment, groups: list[np.ndarray]) -> list[float]:
+    """How much chi-square would rise if groups of amplitudes were held at zero: a^T C^-1 a.
 
-    Each group lists positions of the flat state.
+    Each group lists amplitudes by their number.
     """
-    positions = np.concatenate(groups)
     problem = adjustment.problem
+    positions = problem.network.layout.all("amplitude")
     columns = np.asarray(problem.column)[positions]
-    inverse = np.asarray(_inverse_columns(problem, adjustment.x, jnp.asarray(columns)))[columns]
+    inverse = np.asarray(_inverse_columns(_factors(adjustment), jnp.asarray(columns)))[columns]
     factor = np.asarray(problem.factor)[positions]
     spread = factor[:, None] * inverse * factor
-    values = np.asarray(problem.flat(adjustment.x))[positions]
-    drops, start = [], 0
-    for group in groups:
-        own = slice(start, start + len(group))
-        drops.append(float(values[own] @ np.linalg.solve(spread[own, own], values[own])))
-        start += len(group)
-    return drops
+    values = np.asarray(_flat(problem, adjustment.x))[positions]
+    return [
+        float(values[own] @ np.linalg.solve(spread[np.ix_(own, own)], values[own]))
+        for own in groups
+    ]
 
 
 @eqx.filter_jit
-def _inverse_columns(problem: Problem, x, columns):
-    units = jnp.zeros((problem.n, columns.shape[0])).at[columns, jnp.arange(columns.shape[0])].set(1)
-    return factorise(problem.normal(x).hessian).solve(units)
+def _flat(problem: Problem, x):
+    return problem.flat(x)
+
+
+@eqx.filter_jit
+def _inverse_columns(factors: ArrowFactors, columns):
+    count = columns.shape[0]
+    return factors.solve(jnp.zeros((factors.arrow.in_size(), count)).at[columns, jnp.arange(count)].set(1.0))
 
 
 def standard_deviations(adjustment: Adjustment, scale: float = 1.0) -> State:
     """Standard deviation of every parameter of the state; zero where it is held."""
-    flat = _marginals(adjustment.problem, adjustment.x)
+    flat = _marginals(adjustment.problem, _factors(adjustment))
     return adjustment.problem.network.layout.restore(jnp.sqrt(scale) * flat)
 
 
 @eqx.filter_jit
-def _marginals(problem: Problem, x):
+def _marginals(problem: Problem, factors: ArrowFactors):
     """Square roots of the diagonal of H^-1, in the units of the parameters."""
-    factors = factorise(problem.normal(x).hessian)
     s, groups, d = problem.sizes
     shared = jnp.linalg.inv(factors.reduced) if s else jnp.zeros((0, 0))
     half = jax.vmap(jnp.linalg.inv)(factors.local) if groups else jnp.zeros((0, d, d))

@@ -208,9 +208,9 @@ def scene_problem(scene: Scene, loss: Loss | None = None) -> Problem:
 
 
 @eqx.filter_jit
-def normal_at_start(problem: Problem) -> Normal:
-    """Cost, gradient and normal matrix of a problem at x = 0."""
-    return problem.normal(jnp.zeros(problem.n))
+def normal_at(problem: Problem, x: Float[Array, " n"]) -> Normal:
+    """Cost, gradient and normal matrix of a problem at x."""
+    return problem.normal(x)
 
 
 def scaled(problem: Problem, normal: Normal) -> tuple[Problem, Normal]:
