@@ -5,6 +5,7 @@ jaxvm. Every recording carries the truth as its start values; `without_starts` t
 """
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import cv2
 import numpy as np
@@ -18,12 +19,14 @@ from jaxvm.recording.model import (
     Camera,
     Closure,
     Model,
+    Prior,
     Rangefinder,
     Station,
     Target,
     grid_names,
 )
 from jaxvm.recording.recording import Links, Observations, Ranges, Recording
+from jaxvm.solve.adjust import Adjustment, adjust
 
 IMAGE = (1280, 960)
 HELD = np.zeros(6)
@@ -56,9 +59,9 @@ def at_values(scene: Scene, values: dict[str, np.ndarray]) -> Scene:
 
 def matrix(pose) -> np.ndarray:
     """4x4 matrix of (turn, shift)."""
-    result = np.eye(4)
-    result[:3, :3] = Rotation.from_rotvec(np.asarray(pose, float)[:3]).as_matrix()
-    result[:3, 3] = np.asarray(pose, float)[3:]
+    pose, result = np.array(pose, float), np.eye(4)
+    result[:3, :3] = Rotation.from_rotvec(pose[:3]).as_matrix()
+    result[:3, 3] = pose[3:]
     return result
 
 
@@ -167,7 +170,10 @@ def board_recording(
     n_epochs: int = 8,
     free: frozenset[str] = frozenset({"focal", "centre", "distortion"}),
 ) -> Known:
-    """One camera whose intrinsics are free, and a plane grid with another pose in each epoch."""
+    """One camera whose intrinsics are free, and a plane grid with another pose in each epoch.
+
+    A prior on the centre is so wide that it says nothing.
+    """
     rng = np.random.default_rng(seed)
     place = np.random.default_rng(7)
     camera = Camera(
@@ -195,14 +201,17 @@ def board_recording(
         (camera,),
         (Station("desk", "static", HELD),),
         (Target("board", grid_names(5, 6), marks, "per-epoch", None, frozenset({"pose"})),),
+        priors=(Prior("cameras.cam.centre", camera.centre_px, np.full(2, 1e9)),),
     )
     seen = photographs(model, n_epochs, [[HELD] * n_epochs], [poses], [marks], rng, noise)
     truth = _of_cameras(model.cameras) | {"world_from_target": poses}
     return Known(_recording(model, seen, n_epochs), truth)
 
 
-def stereo_recording(seed: int = 0, noise: float = 1.0, with_ranges: bool = True) -> Known:
-    """Two cameras with different lenses on a bar, a static reference, a moving plate, ranges."""
+def stereo_recording(
+    seed: int = 0, noise: float = 1.0, with_ranges: bool = True, right_lens: str = "opencv4"
+) -> Known:
+    """Two cameras on a bar, a static reference, a plate that moves, and a rangefinder."""
     rng, place, n_epochs = np.random.default_rng(seed), np.random.default_rng(8), 6
     left = Camera(
         "left",
@@ -219,7 +228,7 @@ def stereo_recording(seed: int = 0, noise: float = 1.0, with_ranges: bool = True
         "right",
         "bar",
         IMAGE,
-        "fisheye",
+        right_lens,
         np.array([950.0, 950.0]),
         np.array([633.0, 475.0]),
         np.array([-0.02, 0.004, 1e-3, -1e-3]),
@@ -262,9 +271,7 @@ def stereo_recording(seed: int = 0, noise: float = 1.0, with_ranges: bool = True
         for e, t, p in zip(epoch, target, point, strict=True):
             pose = matrix(targets[t][e])
             distance.append(
-                to_plane(beam, pose)
-                if p < 0
-                else to_point(beam, pose, (reference, plate)[t][p])
+                to_plane(beam, pose) if p < 0 else to_point(beam, pose, (reference, plate)[t][p])
             )
         sigma = np.full(len(epoch), 2e-4)
         distance = np.array(distance) + noise * sigma * rng.standard_normal(len(epoch))
@@ -283,7 +290,7 @@ def to_point(beam: np.ndarray, target: np.ndarray, mark: np.ndarray) -> float:
     return float(np.linalg.norm(target[:3, :3] @ mark + target[:3, 3] - beam[:3, 3]))
 
 
-def free_points_recording(seed: int = 0, noise: float = 1.0) -> Known:
+def free_points_recording(seed: int = 0, noise: float = 1.0, n_epochs: int = 2) -> Known:
     """Four cameras with free poses around a cloud of free points and a known frame."""
     rng, place = np.random.default_rng(seed), np.random.default_rng(9)
     eyes = [(2.4, 0.3, 0.5), (-0.2, 2.6, 1.1), (-2.3, -0.4, 0.2), (0.5, -2.2, 1.6)]
@@ -294,16 +301,16 @@ def free_points_recording(seed: int = 0, noise: float = 1.0) -> Known:
             f"tripod{i}",
             IMAGE,
             "pinhole",
-            np.array([1250.0 + 10 * i] * 2),
+            np.array([1250.0, 1250.0]) + (10.0 * i, 13.0 * i),
             np.array([640.0 + i, 480.0 - i]),
             None,
             HELD,
-            frozenset({"focal"}),
+            frozenset({"focal" if i < 3 else "aspect-locked-focal"}),
         )
         for i in range(4)
     )
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 0.4
-    cloud = place.uniform(-0.5, 0.5, (16, 3))
+    cloud = place.uniform(-0.5, 0.5, (12, 3))
     model = Model(
         "points",
         cameras,
@@ -315,7 +322,7 @@ def free_points_recording(seed: int = 0, noise: float = 1.0) -> Known:
             Target("frame", tuple(f"f{i}" for i in range(8)), corners, "static", HELD),
             Target(
                 "cloud",
-                tuple(f"p{i}" for i in range(16)),
+                tuple(f"p{i}" for i in range(12)),
                 cloud,
                 "static",
                 HELD,
@@ -323,21 +330,21 @@ def free_points_recording(seed: int = 0, noise: float = 1.0) -> Known:
             ),
         ),
     )
-    seen = photographs(
-        model, 1, [[s] for s in stations], [[HELD], [HELD]], [corners, cloud], rng, noise
-    )
+    held = [HELD] * n_epochs
+    standing = [[pose] * n_epochs for pose in stations]
+    seen = photographs(model, n_epochs, standing, [held, held], [corners, cloud], rng, noise)
     truth = _of_cameras(cameras) | {
         "world_from_station": np.array(stations),
         "world_from_target": np.zeros((2, 6)),
         "point": np.concatenate([corners, cloud]),
     }
-    return Known(_recording(model, seen, 1), truth)
+    return Known(_recording(model, seen, n_epochs), truth)
 
 
 def relay_recording(seed: int = 0, noise: float = 1.0) -> Known:
     """Three stations, each with a camera and a target of its own, joined by links only.
 
-    Two links join the stations; three more, between the cameras, form a loop of their own.
+    Two links join the stations; three more, between the cameras, form a loop.
     """
     rng, place = np.random.default_rng(seed), np.random.default_rng(10)
     stations = np.array(
@@ -418,7 +425,7 @@ def relay_recording(seed: int = 0, noise: float = 1.0) -> Known:
         "world_from_target": targets,
         "link": np.array([vector(pose) for pose in true[2:]]),
     }
-    return Known(_recording(model, seen, 1, links=links), truth)
+    return Known(_recording(model, seen, 2, links=links), truth)
 
 
 def photographs_of_pairs(model, stations, targets, marks, rng, noise) -> Observations:
@@ -427,11 +434,71 @@ def photographs_of_pairs(model, stations, targets, marks, rng, noise) -> Observa
     for i, camera in enumerate(model.cameras):
         pose = matrix(stations[i]) @ matrix(camera.pose)
         pixels.append(opencv_pixels(camera, pose, matrix(targets[i]), marks))
-        rows += [(0, i, i, p) for p in range(len(marks))]
+        rows += [(p % 2, i, i, p) for p in range(len(marks))]
     rows, pixels = np.array(rows), np.concatenate(pixels)
     sigma = np.full(len(rows), 0.1)
     pixels = pixels + noise * sigma[:, None] * rng.standard_normal(pixels.shape)
     return Observations(*rows.T, pixels, sigma)
+
+
+def scale_recording(seed: int = 0, noise: float = 1.0, with_ranges: bool = True) -> Known:
+    """Two cameras see nothing but free points: only ranges give the scale."""
+    rng, place = np.random.default_rng(seed), np.random.default_rng(11)
+    left = Camera(
+        "left",
+        "bar",
+        IMAGE,
+        "pinhole",
+        np.array([1200.0, 1200.0]),
+        np.array([640.0, 480.0]),
+        None,
+        HELD,
+    )
+    right = replace(
+        left,
+        name="right",
+        pose=np.array([0.01, -0.3, 0.02, 0.6, 0.02, 0.05]),
+        free=frozenset({"pose"}),
+    )
+    cloud = place.uniform(-0.5, 0.5, (12, 3)) + [0.2, 0.0, 2.2]
+    free = frozenset({"points"})
+    model = Model(
+        "scale",
+        (left, right),
+        (Station("bar", "static", HELD),),
+        (Target("cloud", tuple(f"p{i}" for i in range(12)), cloud, "static", HELD, free),),
+        (Rangefinder("lidar", "bar", np.array([0.0, 0.0, 0.0, 0.1, 0.0, 0.0])),),
+    )
+    seen = photographs(model, 2, [[HELD] * 2], [[HELD] * 2], [cloud], rng, noise, lost=0.0)
+    n = 3
+    distance = [to_point(matrix(model.rangefinders[0].pose), np.eye(4), p) for p in cloud[:n]]
+    sigma = np.full(n, 1e-4)
+    ranges = Ranges(
+        np.zeros(n, int),
+        np.zeros(n, int),
+        np.zeros(n, int),
+        np.arange(n),
+        np.array(distance) + noise * sigma * rng.standard_normal(n),
+        sigma,
+    )
+    truth = _of_cameras(model.cameras) | {"point": cloud}
+    return Known(_recording(model, seen, 2, ranges=ranges if with_ranges else None), truth)
+
+
+RECORDINGS = {
+    "board": board_recording,
+    "stereo": stereo_recording,
+    "points": free_points_recording,
+    "relay": relay_recording,
+    "scale": scale_recording,
+}
+
+
+@cache
+def adjusted(name: str, seed: int = 0) -> tuple[Known, Adjustment]:
+    """A network adjusted from the truth, once for all tests."""
+    known = RECORDINGS[name](seed)
+    return known, adjust(known.true_scene())
 
 
 def without_starts(recording: Recording) -> Recording:
@@ -443,8 +510,12 @@ def without_starts(recording: Recording) -> Recording:
 
     def open_camera(camera: Camera) -> Camera:
         camera = open_pose(camera)
-        if camera.free & {"focal", "aspect-locked-focal"}:
+        if "focal" in camera.free:
             camera = replace(camera, focal_px=None)
+        elif "aspect-locked-focal" in camera.free:
+            # A ratio other than 1 has to be given.
+            own = None if np.ptp(camera.focal_px) == 0 else 1.05 * camera.focal_px
+            camera = replace(camera, focal_px=own)
         if "centre" in camera.free:
             camera = replace(camera, centre_px=None)
         if "distortion" in camera.free:
@@ -478,7 +549,7 @@ def nudged(known: Known, scene: Scene, size: float, seed: int = 3) -> Scene:
     unit = {"focal": 1000.0, "centre": 500.0}
     flat = np.array(scene.state.flatten())
     free = scene.unknowns.column < scene.unknowns.n
-    for name, shape in scene.network.layout.fields:
+    for name, _ in scene.network.layout.fields:
         own = scene.network.layout.all(name)
         own = own[free[own]]
         flat[own] += size * unit.get(name, 1.0) * rng.uniform(-1.0, 1.0, len(own))

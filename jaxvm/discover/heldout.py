@@ -82,7 +82,7 @@ def evaluate(scene: Scene, held: np.ndarray, sound: tuple[np.ndarray, ...]) -> H
         weights=weights,
         range_weights=range_weights_of(scene, held),
         active=scene.unknowns.of_one_epoch,
-        rtol=1e-8,
+        rtol=1e-7,
         damping=1e-6,
         check=False,
     )

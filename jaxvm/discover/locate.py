@@ -62,9 +62,7 @@ def residual_table(scene: Scene, whitened, used, reference_px: float) -> Residua
     for rows, block, weight in zip(scene.tables, whitened, used, strict=True):
         residual[rows] = -np.asarray(block) * reference_px
         sound[rows] = np.asarray(weight) > 0
-    return ResidualTable(
-        obs.pixel, residual, obs.camera, obs.target, obs.point, obs.epoch, sound
-    )
+    return ResidualTable(obs.pixel, residual, obs.camera, obs.target, obs.point, obs.epoch, sound)
 
 
 def locate(scene: Scene, table: ResidualTable, alpha: float = 1e-4) -> list[Place]:

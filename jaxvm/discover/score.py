@@ -27,13 +27,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxvm.discover.hypotheses import Family, Hypothesis, member
+from jaxvm.network.binding import in_scope, observation_driver_table, ranges_in_scope
 from jaxvm.network.residual import port_jacobian, whitening
-from jaxvm.network.scene import (
-    Scene,
-    in_scope,
-    observation_driver_table,
-    ranges_in_scope,
-)
+from jaxvm.network.scene import Scene
 from jaxvm.physics.drivers import pattern
 from jaxvm.physics.forms import BASIS_INDEX, FORMS, evaluate_basis
 from jaxvm.physics.ports import PORT_INDEX
@@ -197,9 +193,7 @@ def arrange(adjustment: Adjustment) -> Arrangement:
         half=jnp.asarray(in_cells(halves)),
         group=jnp.asarray(_padded_lists(distinct[:, 0], n_groups, len(distinct))),
         group_of=jnp.asarray(np.where(distinct[:, 0] < 0, n_groups, distinct[:, 0])),
-        epoch=jnp.asarray(
-            _padded_lists(distinct[:, 1], len(scene.recording.time), len(distinct))
-        ),
+        epoch=jnp.asarray(_padded_lists(distinct[:, 1], len(scene.recording.time), len(distinct))),
         n_local=problem.sizes[2],
     )
     return Arrangement(
@@ -277,24 +271,21 @@ def score_residuals(
         )
         null = np.maximum(null, np.asarray(largest))
 
-        def spread(values, fill=0.0, used=used, shape=(len(family.groups), n_courses, n_scopes)):
-            values = np.asarray(values)
-            full = np.full((shape[0], shape[1] * shape[2], *values.shape[2:]), fill, values.dtype)
-            full[:, used] = values
-            return full.reshape(*shape, *values.shape[2:])
-
-        results.append(
-            Scores(
-                family,
-                spread(drop),
-                spread(z, -np.inf),
-                spread(amplitude),
-                spread(seen),
-                spread(sound, False),
-                variance,
+        scored = [
+            _spread(np.asarray(values), used, family.valid.shape, fill)
+            for values, fill in (
+                (drop, 0.0), (z, -np.inf), (amplitude, 0.0), (seen, 0.0), (sound, False),
             )
-        )
+        ]  # fmt: skip
+        results.append(Scores(family, *scored, variance))
     return Ranking(tuple(results), null)
+
+
+def _spread(values: np.ndarray, used: np.ndarray, shape: tuple[int, ...], fill) -> np.ndarray:
+    """Values of the used pairs of course and scope, put among all pairs."""
+    full = np.full((shape[0], shape[1] * shape[2], *values.shape[2:]), fill, values.dtype)
+    full[:, used] = values
+    return full.reshape(*shape, *values.shape[2:])
 
 
 def _group_arrays(scene: Scene, arrangement: Arrangement, family: Family):
@@ -321,7 +312,9 @@ def _mark_mask(scene: Scene, arrangement: Arrangement, mark: tuple[int, int]) ->
     obs = scene.recording.observations
     own = np.zeros(len(arrangement.drivers) + 1)
     for start, rows in zip(arrangement.starts, scene.tables, strict=False):
-        own[start : start + len(rows)] = (obs.target[rows] == mark[0]) & (obs.point[rows] == mark[1])
+        own[start : start + len(rows)] = (obs.target[rows] == mark[0]) & (
+            obs.point[rows] == mark[1]
+        )
     return own[arrangement.rows]
 
 
@@ -390,10 +383,10 @@ def _kernel(
     padded_half = jnp.concatenate([cells.half[:, :, d:], zero[:, :, d:]])
     residual = _without_local(cells)
     padded_residual = jnp.concatenate([residual, jnp.zeros((1, residual.shape[1]))])
+    touched = jnp.sum(cells.by(cells.epoch, jnp.sum(cells.residual**2, axis=1)), axis=1) > 0.0
+    n_fitted = jnp.maximum(jnp.sum(touched), 2.0)
     # What each epoch contributes to the gradient of the shared unknowns.
-    pull = jnp.einsum(
-        "ewr,ewrs->es", padded_residual[cells.epoch], padded_half[cells.epoch]
-    )
+    pull = jnp.einsum("ewr,ewrs->es", padded_residual[cells.epoch], padded_half[cells.epoch])
 
     def one(inputs):
         port, own_pattern, own_valid = inputs
@@ -427,11 +420,13 @@ def _kernel(
         part_w = whiten(root, parts * unit[:, :, None])  # b c e
         score_w = jnp.sum(part_w, axis=2)
         drop = jnp.sum(score_w**2, axis=1)
-        back = jax.vmap(
-            lambda m, v: jax.scipy.linalg.solve_triangular(m, v, lower=True, trans=1)
-        )(root, score_w)
+        back = jax.vmap(lambda m, v: jax.scipy.linalg.solve_triangular(m, v, lower=True, trans=1))(
+            root, score_w
+        )
         amplitude = -back * unit
-        flipped = jnp.einsum("bce,er->bcr", part_w, signs)
+        # A fitted residual lacks what the shared unknowns take of its epoch, about 1/epochs.
+        lost = jnp.maximum(1.0 - 1.0 / n_fitted, 0.5)
+        flipped = jnp.einsum("bce,er->bcr", part_w, signs) / jnp.sqrt(lost)
         null_drop = jnp.sum(flipped**2, axis=1)
 
         seen = jnp.max(jnp.diagonal(scaled, axis1=1, axis2=2), axis=1)

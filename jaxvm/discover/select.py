@@ -22,6 +22,8 @@ DECIDED = 2.0 * np.log(20.0)
 CLEAR = 15.0
 """Difference of foretold evidence between two courses of the same terms that a refit won't turn."""
 
+_RTOL, _MAX_STEPS = 1e-6, 20
+
 UNNAMED_PRIOR = 0.01
 """Weight of a hypothesis that no engineer has a name for, against one of the catalogue."""
 
@@ -109,32 +111,33 @@ def refit(
 ) -> Candidate | None:
     """Refit everything with a hypothesis in, nonlinear constants free.
 
-    None where the fit fails or a constant leaves the range that the recording can show.
+    None where the fit does not converge: what the recording hardly tells from the plain model has
+    no size of its own.
     """
     # From amplitude zero the first step moves everything together.
     effects = (*base.scene.fitted_effects(), hypothesis.effect(0.0 * amplitudes))
     scene = base.scene.with_effects(effects, room)
-    fitted = adjust(
-        scene, weights=weights, range_weights=range_weights, rtol=1e-8,
-        damping=1e-6, max_steps=30, check=False,
-    )  # fmt: skip
-    effect = fitted.scene.fitted_effects()[-1]
-    if not np.isfinite(fitted.cost) or not _sensible(scene, effect):
-        # The grid's constants are good enough when a refined one runs away.
-        still = hypothesis_constants_held(scene)
-        fitted = adjust(
+
+    def fit(active=None):
+        return adjust(
             scene,
             weights=weights,
             range_weights=range_weights,
-            active=still,
-            rtol=1e-8,
+            active=active,
+            rtol=_RTOL,
             damping=1e-6,
-            max_steps=30,
+            max_steps=_MAX_STEPS,
             check=False,
         )
+
+    fitted = fit()
+    effect = fitted.scene.fitted_effects()[-1]
+    if effect.constants and not (fitted.converged and _sensible(scene, effect)):
+        # The grid's constants are good enough when a refined one runs away.
+        fitted = fit(hypothesis_constants_held(scene))
         effect = fitted.scene.fitted_effects()[-1]
-        if not np.isfinite(fitted.cost):
-            return None
+    if not fitted.converged:
+        return None
     variance = fitted.variance_factor
     drop = 2.0 * (base.cost - fitted.cost)
     own = evidence(hypothesis, drop, np.asarray(effect.amplitudes), variance, n)

@@ -54,6 +54,19 @@ def so3_exp(turn: Float[Array, "3"]) -> Float[Array, "3 3"]:
     return jnp.eye(3) * (1.0 - b * square) + a * hat(turn) + b * outer
 
 
+def rotate(turn: Float[Array, "3"], vector: Float[Array, "3"]) -> Float[Array, "3"]:
+    """so3_exp(turn) @ vector without the matrix: v + a w x v + b w x (w x v)."""
+    a, b, _ = _sine_coefficients(turn @ turn)
+    once = _cross(turn, vector)
+    return vector + a * once + b * _cross(turn, once)
+
+
+def _cross(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
+    return jnp.stack(
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    )
+
+
 def quaternion_from_rotation(rotation: Float[Array, "3 3"]) -> Float[Array, "4"]:
     """Unit quaternion (w, x, y, z) of a rotation, w >= 0, from its largest component.
 

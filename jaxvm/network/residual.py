@@ -66,6 +66,7 @@ class Residuals(NamedTuple):
     priors: Float[Array, "observations 1"] | None
 
 
+@eqx.filter_jit
 def residual(state: State, network: Network) -> Residuals:
     """Whitened residuals of all observations: the one function of the project.
 
@@ -95,7 +96,10 @@ def whitening(factor: Factor) -> Float[Array, "observations components"]:
 
 
 def rows(
-    factor: Factor, network: Network, flat: Float[Array, " n"], values: Float[Array, "columns epochs"]
+    factor: Factor,
+    network: Network,
+    flat: Float[Array, " n"],
+    values: Float[Array, "columns epochs"],
 ) -> Float[Array, "observations components"]:
     """Predicted minus measured of one table, in its unit."""
     course = _course(factor, network, flat, values, None)
@@ -143,6 +147,7 @@ def _local(factor, network, row: Row, course: Course | None, data, disturbance=N
     return factor.local(row.own, data, PortValues(ports))
 
 
+@eqx.filter_jit
 def block_jacobian(
     factor: Factor, network: Network, flat: Float[Array, " n"], live: tuple[int, ...]
 ) -> Float[Array, "observations components slots"]:
@@ -154,6 +159,8 @@ def block_jacobian(
     """
     row = _gather(factor, network, flat)
     values, structure = jax.tree.flatten(row)
+    if not live:
+        return jnp.zeros((factor.slots.shape[0], factor.sigma.shape[1], 0))
     ends = np.cumsum([value.shape[1] for value in values])
     first = np.concatenate([[0], ends])[:-1]
     # Only parameters with a wanted slot are differentiated; the others are constants.

@@ -213,6 +213,7 @@ def _consensus(options) -> np.ndarray:
 
 def _check_reached(scene: Scene, known, waiting) -> None:
     missing = {key for a, b, _, _ in waiting for key in (*a, *b) if key not in known}
+    missing |= _observed(scene) - known.keys()
     if not missing:
         return
     names = set()
@@ -228,6 +229,21 @@ def _check_reached(scene: Scene, known, waiting) -> None:
         f"no chain of views or links reaches {', '.join(sorted(names))} from the bodies with a "
         "known pose; give a pose in recording.toml or record a view that joins the parts"
     )
+
+
+def _observed(scene: Scene) -> set[tuple[str, int]]:
+    """Keys of all bodies that an image point depends on."""
+    obs, model = scene.recording.observations, scene.model
+    names = [s.name for s in model.stations]
+    station_of = np.array([names.index(c.station) for c in model.cameras], int)
+    keys = {("camera", int(i)) for i in np.unique(obs.camera)}
+    keys |= {
+        ("station", int(row))
+        for row in np.unique(scene.station_row[station_of[obs.camera], obs.epoch])
+    }
+    return keys | {
+        ("target", int(row)) for row in np.unique(scene.target_row[obs.target, obs.epoch])
+    }
 
 
 def _with_poses(scene: Scene, known) -> Scene:

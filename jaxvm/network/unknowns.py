@@ -6,12 +6,20 @@ ones (the poses of one epoch, or one point) touch only their own observations an
 first. `column` of a held parameter is `n`, one past the last.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxvm.geometry.lenses import lens_family
 from jaxvm.network.state import Layout
+from jaxvm.physics.forms import FORMS
+
+if TYPE_CHECKING:
+    from jaxvm.network.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -117,3 +125,125 @@ def local_groups(layout: Layout, candidates: dict[str, np.ndarray], free: np.nda
     if not counts or counts[best] == 0:
         return np.full(layout.size, -1)
     return candidates[best]
+
+
+def free_unknowns(scene: Scene) -> Unknowns:
+    """Free parameters of the engineer's model, plus all amplitudes and refinable constants."""
+    model, layout = scene.model, scene.network.layout
+    n_epochs = len(scene.recording.time)
+    free = np.zeros(layout.size, bool)
+    tie = np.arange(layout.size)
+    factor = np.ones(layout.size)
+    label = [""] * layout.size
+    by_epoch, by_point = np.full(layout.size, -1), np.full(layout.size, -1)
+
+    def release(slots, names):
+        free[slots] = True
+        for slot, name in zip(np.ravel(slots), names, strict=True):
+            label[slot] = name
+
+    pose_parts = [f"turn {a}" for a in "xyz"] + [f"shift {a}" for a in "xyz"]
+    for i, camera in enumerate(model.cameras):
+        own = np.array([i])
+        focal = layout.slots("focal", own)[0]
+        if "focal" in camera.free:
+            release(focal, [f"camera {camera.name}: focal {a}" for a in "xy"])
+        if "aspect-locked-focal" in camera.free:
+            release(focal, [f"camera {camera.name}: focal"] * 2)
+            tie[focal[1]] = focal[0]
+            ratio = np.asarray(scene.state.focal[i])
+            factor[focal[1]] = ratio[1] / ratio[0]
+        if "centre" in camera.free:
+            slots = layout.slots("centre", own)[0]
+            release(slots, [f"camera {camera.name}: centre {a}" for a in "xy"])
+        n = lens_family(camera.lens).n_coefficients
+        if "distortion" in camera.free and n:
+            slots = layout.slots("distortion", own, n)[0]
+            release(slots, [f"camera {camera.name}: distortion {k + 1}" for k in range(n)])
+        if "pose" in camera.free:
+            slots = layout.slots("station_from_camera", own)[0]
+            release(slots, [f"camera {camera.name} in its station: {p}" for p in pose_parts])
+
+    ids = scene.recording.epoch_ids
+    bodies = [
+        ("station", model.stations, scene.station_row, "world_from_station"),
+        ("target", model.targets, scene.target_row, "world_from_target"),
+    ]
+    for kind, of_kind, rows, table in bodies:
+        for i, body in enumerate(of_kind):
+            if "pose" not in body.free:
+                continue
+            moving = body.motion == "per-epoch"
+            seen = _epochs_seen(scene, kind, i)
+            for epoch in range(n_epochs) if moving else (0,):
+                if moving and not seen[epoch]:
+                    continue
+                slots = layout.slots(table, rows[i, epoch : epoch + 1])[0]
+                when = f" at epoch {ids[epoch]}" if moving else ""
+                release(slots, [f"{kind} {body.name}{when}: {p}" for p in pose_parts])
+                if moving:
+                    by_epoch[slots] = epoch
+    for i, target in enumerate(model.targets):
+        if "points" in target.free:
+            rows = np.arange(scene.first_point[i], scene.first_point[i + 1])
+            slots = layout.slots("point", rows)
+            names = [f"point {p} of target {target.name}: {a}" for p in target.point_names
+                     for a in "xyz"]  # fmt: skip
+            release(slots, names)
+            by_point[slots] = rows[:, None]
+    for i, finder in enumerate(model.rangefinders):
+        if "pose" in finder.free:
+            slots = layout.slots("station_from_rangefinder", np.array([i]))[0]
+            release(slots, [f"rangefinder {finder.name}: {p}" for p in pose_parts])
+    links = layout.all("link")
+    release(links, [f"link {k // 6}: {pose_parts[k % 6]}" for k in range(len(links))])
+    idle = _release_effects(scene, layout, release, factor)
+    group = local_groups(layout, {"epochs": by_epoch, "points": by_point}, free)
+    momentary = np.flatnonzero(free & (by_epoch >= 0))
+    return arrange(free, group, tie, factor, tuple(label), idle, momentary)
+
+
+def _release_effects(scene: Scene, layout: Layout, release, factor) -> np.ndarray:
+    """Give every column and constant an unknown; returns the positions that stay idle.
+
+    Spare columns and constants that can't be refined have an unknown too, so that the sizes of a
+    problem depend on the room for effects and not on the effects.
+    """
+    amplitude, constant = layout.all("amplitude"), layout.all("constant")[:-1]
+    release(amplitude, ["spare amplitude"] * len(amplitude))
+    release(constant, ["spare constant"] * len(constant))
+    busy = np.zeros(layout.size, bool)
+    column, first = 0, 0
+    for effect in scene.effects:
+        form = FORMS[effect.form]
+        n, m = effect.n_columns, len(effect.constants)
+        release(amplitude[column : column + n], [f"{effect.name}: amplitude"] * n)
+        release(
+            constant[first : first + m],
+            [f"{effect.name}: {form.constants[k].name}" for k in range(m)],
+        )
+        busy[amplitude[column : column + n]] = True
+        refined = [first + k for k in range(m) if form.constants[k].refined]
+        busy[constant[refined]] = True
+        column, first = column + n, first + m
+    # The unknown of a constant is its relative change.
+    factor[constant] = np.asarray(scene.state.constant)[:-1]
+    slots = np.concatenate([amplitude, constant])
+    return slots[~busy[slots]]
+
+
+def _epochs_seen(scene: Scene, kind: str, number: int) -> np.ndarray:
+    """Epochs in which a moving body is touched by any observation."""
+    obs, model = scene.recording.observations, scene.model
+    seen = np.zeros(len(scene.recording.time), bool)
+    names = [s.name for s in model.stations]
+    station_of = np.array([names.index(c.station) for c in model.cameras])
+    own = obs.target == number if kind == "target" else station_of[obs.camera] == number
+    seen[obs.epoch[own]] = True
+    links = scene.recording.links
+    if links is not None:
+        for nodes in (links.from_node, links.to_node):
+            for node, epoch in zip(nodes, links.epoch, strict=True):
+                if node == (kind, number):
+                    seen[max(epoch, 0)] = True
+    return seen

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from jaxvm.geometry.lenses import LensFamily
 from jaxvm.geometry.poses import Pose, pose_from_vector
-from jaxvm.geometry.rotations import so3_exp
+from jaxvm.geometry.rotations import rotate
 from jaxvm.physics.ports import PortValues
 
 WINDOW_INDEX = 1.52
@@ -96,7 +96,7 @@ def place(
         return arm + world_from_target.shift
     turn = ports.axes("structure.turn") + delay * velocity[3:]
     shift = ports.axes("structure.shift") + delay * velocity[:3]
-    return so3_exp(turn) @ arm + world_from_target.shift + shift
+    return rotate(turn, arm) + world_from_target.shift + shift
 
 
 def exposure_delay(
@@ -130,7 +130,7 @@ def _disturb(point: Float[Array, "3"], body: str, ports: PortValues) -> Float[Ar
     if ports.plain:
         return point
     # The body turns by +omega and moves by +s in its own axes, so what it sees does the opposite.
-    return so3_exp(-ports.axes(f"{body}.turn")) @ (point - ports.axes(f"{body}.shift"))
+    return rotate(-ports.axes(f"{body}.turn"), point - ports.axes(f"{body}.shift"))
 
 
 # --- medium -------------------------------------------------------------------------------------
@@ -225,7 +225,9 @@ def predict_pixel(
         ports,
     )
     apparent = refract(camera, ports)
-    return expose(sight.focal, sight.centre, image(family, sight.distortion, apparent, ports), ports)
+    return expose(
+        sight.focal, sight.centre, image(family, sight.distortion, apparent, ports), ports
+    )
 
 
 # --- rangefinder --------------------------------------------------------------------------------

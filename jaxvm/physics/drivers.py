@@ -2,9 +2,10 @@
 
 Time-like drivers are channels (recorded quantities, time, time since power-on). Observation-like
 drivers are computed for each observation from the present model; they are circumstances, not
-unknowns, and are held while a model is fitted. The place in the image is the *predicted* one: the
-measured one contains the residual, and a pattern made of residuals explains everything. Only the
-phase within a pixel is taken from the measurement, because a prediction is not that good.
+unknowns, and are held while a model is fitted. The place in the image is the *predicted* one, the
+phase within a pixel included: the measured one contains the residual, and a pattern made of
+residuals explains noise. (A mark at rest shows noise e at phase phi; e sin 2 pi (phi + e) does not
+average out.)
 """
 
 from collections.abc import Callable
@@ -90,8 +91,8 @@ def observation_drivers(
             jnp.linalg.norm(from_centre),
             from_centre[0],
             from_centre[1],
-            at.pixel[0],
-            at.pixel[1],
+            predicted[0],
+            predicted[1],
             distance,
             1.0 / distance,
             jnp.arccos(jnp.clip(jnp.abs(cosine), 0.0, 1.0)),

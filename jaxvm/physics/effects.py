@@ -214,7 +214,9 @@ def courses(
     """Course of every column at the epochs. Differentiable in the constants."""
     x = channels.values[table.channel] - table.reference[:, None]
     own = constants[table.constant_index]
-    on_grid = jax.vmap(lambda b, xi, c: evaluate_basis(b, xi, channels.time, c))(table.basis, x, own)
+    on_grid = jax.vmap(lambda b, xi, c: evaluate_basis(b, xi, channels.time, c))(
+        table.basis, x, own
+    )
     return channels.at_epochs(on_grid)
 
 

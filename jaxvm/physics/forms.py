@@ -154,7 +154,9 @@ FORMS: dict[str, Form] = {
         ),
         Form("onset", ("onset",), (_TAU,), "settling exponentially with {driver}"),
         Form("creep", ("log",), (_TAU,), "creeping with the logarithm of {driver}"),
-        Form("step", ("step",), (Constant("instant", "s", refined=False),), "suddenly, in {driver}"),
+        Form(
+            "step", ("step",), (Constant("instant", "s", refined=False),), "suddenly, in {driver}"
+        ),
         Form("ramp", ("ramp",), (Constant("start", "s"),), "steadily from a moment in {driver} on"),
         Form(
             "periodic",

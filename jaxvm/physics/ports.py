@@ -46,9 +46,7 @@ class Port:
 
 
 def _axes(prefix: str, stage: str, unit: str, largest: float, meaning: str) -> tuple[Port, ...]:
-    return tuple(
-        Port(f"{prefix}_{a}", stage, unit, largest, meaning.format(axis=a)) for a in "xyz"
-    )
+    return tuple(Port(f"{prefix}_{a}", stage, unit, largest, meaning.format(axis=a)) for a in "xyz")
 
 
 PORTS: tuple[Port, ...] = (
@@ -57,14 +55,32 @@ PORTS: tuple[Port, ...] = (
     Port("target.scale_y", "target", "1", 0.02, "the target grows along its y axis only"),
     Port("target.bow_x", "target", "m", 0.05, "the middle rises along +z against the x edges"),
     Port("target.bow_y", "target", "m", 0.05, "the middle rises along +z against the y edges"),
-    Port("target.twist", "target", "m", 0.05, "the corners where x and y agree in sign rise along +z"),
+    Port(
+        "target.twist", "target", "m", 0.05, "the corners where x and y agree in sign rise along +z"
+    ),
     *_axes("target.point", "target", "m", 0.02, "a mark moves along the target's {axis} axis"),
-    *_axes("structure.shift", "structure", "m", 0.5, "the target moves along the world's {axis} axis"),
-    *_axes("structure.turn", "structure", "rad", 0.1, "the target turns about the world's {axis} axis"),
+    *_axes(
+        "structure.shift", "structure", "m", 0.5, "the target moves along the world's {axis} axis"
+    ),
+    *_axes(
+        "structure.turn", "structure", "rad", 0.1, "the target turns about the world's {axis} axis"
+    ),
     Port("clock.offset", "shutter", "s", 0.1, "the exposure is later than the recorded time"),
     Port("shutter.row_time", "shutter", "s", 0.2, "the last row is exposed later than the first"),
-    Port("medium.bend_u", "medium", "rad/m", 0.0001, "a path of length L displaces the mark L²/2 along u"),
-    Port("medium.bend_v", "medium", "rad/m", 0.0001, "a path of length L displaces the mark L²/2 along v"),
+    Port(
+        "medium.bend_u",
+        "medium",
+        "rad/m",
+        0.0001,
+        "a path of length L displaces the mark L²/2 along u",
+    ),
+    Port(
+        "medium.bend_v",
+        "medium",
+        "rad/m",
+        0.0001,
+        "a path of length L displaces the mark L²/2 along v",
+    ),
     Port("medium.window", "medium", "m", 0.05, "thickness of a plane glass plate before the lens"),
     *_axes("station.turn", "station", "rad", 0.02, "the station turns about its own {axis} axis"),
     *_axes("station.shift", "station", "m", 0.1, "the station moves along its own {axis} axis"),
@@ -77,7 +93,9 @@ PORTS: tuple[Port, ...] = (
     Port("lens.p2", "lens", "1", 0.02, "decentring distortion, second coefficient"),
     Port("lens.tilt_x", "lens", "rad", 0.05, "the sensor tilts about x behind the lens"),
     Port("lens.tilt_y", "lens", "rad", 0.05, "the sensor tilts about y behind the lens"),
-    Port("lens.entrance", "lens", "m", 0.03, "the entrance pupil moves forward with the field angle²"),
+    Port(
+        "lens.entrance", "lens", "m", 0.03, "the entrance pupil moves forward with the field angle²"
+    ),
     Port("sensor.focal", "sensor", "1", 0.05, "the principal distance grows"),
     Port("sensor.aspect", "sensor", "1", 0.02, "the principal distance along u grows"),
     Port("sensor.cx", "sensor", "px", 30.0, "the principal point moves along u"),

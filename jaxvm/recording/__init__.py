@@ -4,6 +4,7 @@ A recording is a folder with `recording.toml` (cameras, stations, targets, what 
 (`observations`, `epochs`, and if there are any `drivers`, `ranges`, `links`) as csv or parquet.
 """
 
+from jaxvm.recording.convert import convert, describe
 from jaxvm.recording.datasets import DATASETS, find_data, open_recording
 from jaxvm.recording.errors import RecordingError
 from jaxvm.recording.importers import (
@@ -42,6 +43,8 @@ __all__ = [
     "Station",
     "Target",
     "board_recording",
+    "convert",
+    "describe",
     "find_data",
     "import_cameramodel",
     "import_corner_table",

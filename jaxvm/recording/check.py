@@ -39,9 +39,11 @@ def _pixels(recording: Recording, table: Table) -> None:
     inside = (obs.pixel > -margin) & (obs.pixel < size[obs.camera] + margin)
     table.check(
         inside.all(axis=1),
-        lambda row: f"({obs.pixel[row, 0]:.6g}, {obs.pixel[row, 1]:.6g}) px is outside the image "
-        f'of camera "{model.cameras[obs.camera[row]].name}" '
-        f"({size[obs.camera[row], 0]:g} x {size[obs.camera[row], 1]:g} px); mend it or image_size",
+        lambda row: (
+            f"({obs.pixel[row, 0]:.6g}, {obs.pixel[row, 1]:.6g}) px is outside the image "
+            f'of camera "{model.cameras[obs.camera[row]].name}" '
+            f"({size[obs.camera[row], 0]:g} x {size[obs.camera[row], 1]:g} px); mend it or image_size"
+        ),
     )
 
 
@@ -52,8 +54,10 @@ def _repeats(recording: Recording, table: Table) -> None:
     first_of = first[np.ravel(inverse)]
     table.check(
         first_of == np.arange(len(key)),
-        lambda row: "this camera has the same point in the same epoch in "
-        f"{table.word} {table.line[first_of[row]]} already; keep one",
+        lambda row: (
+            "this camera has the same point in the same epoch in "
+            f"{table.word} {table.line[first_of[row]]} already; keep one"
+        ),
     )
 
 

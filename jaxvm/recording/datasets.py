@@ -2,13 +2,15 @@
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pooch
 
 from jaxvm.recording.errors import RecordingError
 from jaxvm.recording.importers import import_cameramodel, import_corner_table
+from jaxvm.recording.model import Model
+from jaxvm.recording.read import read_model
 from jaxvm.recording.recording import Recording
 
 _MRCAL = (
@@ -60,8 +62,10 @@ def find_data(name: str) -> Path | None:
     return None
 
 
-def open_recording(name: str) -> Recording:
+def open_recording(name: str, model: str | Path | None = None) -> Recording:
     """A public recording by name, fetched when there is no local copy.
+
+    `model` is a file in the form of recording.toml to take instead of the plain model.
 
     Raises:
         RecordingError: the name is not known, or it can't be fetched.
@@ -69,6 +73,15 @@ def open_recording(name: str) -> Recording:
     if name not in DATASETS:
         known = ", ".join(DATASETS)
         raise RecordingError(f'there is no public recording "{name}"; known here: {known}')
+    recording = _open(name)
+    if model is None:
+        return recording
+    parsed, _ = read_model(model)
+    _same_bodies(recording, parsed, Path(model).name)
+    return replace(recording, model=parsed)
+
+
+def _open(name: str) -> Recording:
     dataset = DATASETS[name]
     if (local := find_data(dataset.local)) is not None:
         return dataset.read_local(local)
@@ -82,3 +95,19 @@ def open_recording(name: str) -> Recording:
             f"{dataset.local} into a folder and name that folder in JAXVM_DATA"
         ) from None
     return dataset.read_published(Path(file))
+
+
+def _same_bodies(recording: Recording, model: Model, file: str) -> None:
+    for kind in ("cameras", "targets"):
+        own, other = ([b.name for b in getattr(m, kind)] for m in (recording.model, model))
+        if own != other:
+            raise RecordingError(
+                f"{file}: its {kind} are {', '.join(other)}, the recording's {', '.join(own)}; "
+                "give a model of this recording"
+            )
+    for own, other in zip(recording.model.targets, model.targets, strict=True):
+        if own.point_names != other.point_names:
+            raise RecordingError(
+                f'{file}: target "{own.name}" has other points than in the recording; '
+                "give a model of this recording"
+            )

@@ -78,9 +78,7 @@ class Entry:
         value = default if default is not None and key not in self else None
         value = self.needs(key, f'"{known[0]}"') if value is None else value
         if not isinstance(value, str) or value not in known:
-            self.fail(
-                key, f"{self.title(key)} is {value!r}; it must be one of {', '.join(known)}"
-            )
+            self.fail(key, f"{self.title(key)} is {value!r}; it must be one of {', '.join(known)}")
         return value
 
     def number(self, key: str, default: float | None = None) -> float | None:

@@ -267,7 +267,9 @@ def import_cameramodel(file: str | Path) -> Recording:
 
 
 def import_opencv_calibration(
-    file: str | Path, image_size: tuple[int, int] | None = None, extrinsics: str | Path | None = None
+    file: str | Path,
+    image_size: tuple[int, int] | None = None,
+    extrinsics: str | Path | None = None,
 ) -> tuple[Camera, ...]:
     """Cameras from OpenCV's calibration YAML (or XML), held at the calibrated values.
 

@@ -148,7 +148,7 @@ def model_to_toml(model: Model) -> dict[str, Any]:
     if model.name:
         table["name"] = model.name
     table["noise"] = {"pixel_px": float(model.pixel_sigma), "range_m": float(model.range_sigma)}
-    table["cameras"] = {camera.name: _camera_table(camera) for camera in model.cameras}
+    table["cameras"] = {camera.name: camera_table(camera) for camera in model.cameras}
     table["stations"] = {
         station.name: {"motion": station.motion, **_held(station.pose, station.free)}
         for station in model.stations
@@ -188,7 +188,8 @@ def model_to_toml(model: Model) -> dict[str, Any]:
     return table
 
 
-def _camera_table(camera: Camera) -> dict[str, Any]:
+def camera_table(camera: Camera) -> dict[str, Any]:
+    """A camera as a table of recording.toml."""
     table: dict[str, Any] = {
         "station": camera.station,
         "image_size": [int(n) for n in camera.image_size],

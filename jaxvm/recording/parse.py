@@ -136,9 +136,7 @@ def _camera(name: str, entry: Entry, station: str, pose, carries_frame: bool) ->
         if pose is None and not carries_frame:
             free |= {"pose"}
     if {"focal", "aspect-locked-focal"} <= free:
-        entry.fail(
-            "free", f'{entry.title("free")} has "focal" and "aspect-locked-focal"; keep one'
-        )
+        entry.fail("free", f'{entry.title("free")} has "focal" and "aspect-locked-focal"; keep one')
     if pose is None and "pose" not in free:
         if not carries_frame:
             entry.fail(
@@ -304,9 +302,7 @@ def _prior(entry: Entry, model: Model) -> Prior:
     kind, name, quantity = parts
     named = {body.name: body for body in bodies[kind][0]}
     if name not in named:
-        entry.fail(
-            "parameter", f'there is no "{name}" in [{kind}] {has(named)}; mend the name'
-        )
+        entry.fail("parameter", f'there is no "{name}" in [{kind}] {has(named)}; mend the name')
     width = {"focal": 2, "centre": 2, "pose": 6}.get(quantity, 0)
     body = named[name]
     if isinstance(body, Camera) and quantity == "distortion":

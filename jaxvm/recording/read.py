@@ -99,8 +99,10 @@ def _epochs(table: Table, model: Model):
         later = np.append(True, np.diff(time) > 0.0)
         table.check(
             later,
-            lambda row: f"t = {time[row]:.12g} s is not after {time[row - 1]:.12g} s; "
-            "sort the epochs by time, each with a time of its own",
+            lambda row: (
+                f"t = {time[row]:.12g} s is not after {time[row - 1]:.12g} s; "
+                "sort the epochs by time, each with a time of its own"
+            ),
         )
         if len(time) > 1 and np.median(np.diff(time)) > 3e5 and time[0] > 1e10:
             raise table.error(
@@ -131,8 +133,10 @@ def _epoch_rows(table: Table, ids: np.ndarray) -> np.ndarray:
     rows = np.array([place.get(number, -1) for number in epoch.tolist()], int)
     table.check(
         rows >= 0,
-        lambda row: f"epoch {epoch[row]} is not in the epochs ({ids[0]} to {ids[-1]}); "
-        "add it there or drop the row",
+        lambda row: (
+            f"epoch {epoch[row]} is not in the epochs ({ids[0]} to {ids[-1]}); "
+            "add it there or drop the row"
+        ),
     )
     return rows
 
@@ -149,9 +153,11 @@ def _point_rows(table: Table, model: Model, target: np.ndarray, plane: bool) -> 
     )
     table.check(
         point > -2,
-        lambda row: f'point "{names[row]}" is not on target '
-        f'"{model.targets[target[row]].name}" {has(known[target[row]])}; '
-        f"{did_you_mean(names[row], known[target[row]])}",
+        lambda row: (
+            f'point "{names[row]}" is not on target '
+            f'"{model.targets[target[row]].name}" {has(known[target[row]])}; '
+            f"{did_you_mean(names[row], known[target[row]])}"
+        ),
     )
     return point
 
@@ -162,8 +168,10 @@ def _sigma(table: Table, default: float, unit: str) -> np.ndarray:
     sigma = table.numbers("sigma", f"a standard deviation in {unit}")
     table.check(
         sigma > 0.0,
-        lambda row: f"sigma is {sigma[row]:g}; it must be above 0 ({unit}), "
-        "drop the row if the measurement is no good",
+        lambda row: (
+            f"sigma is {sigma[row]:g}; it must be above 0 ({unit}), "
+            "drop the row if the measurement is no good"
+        ),
     )
     return sigma
 
@@ -214,8 +222,10 @@ def _drivers(table: Table | None, model: Model, time: np.ndarray, timed: bool) -
         if name.lower().endswith("degc"):
             table.check(
                 (values > -80.0) & (values < 150.0),
-                lambda row, v=values, n=name: f"{n} is {v[row]:g}, which is no temperature in "
-                f"degrees Celsius{' (kelvin?)' if v[row] > 200 else ''}; convert the column",
+                lambda row, v=values, n=name: (
+                    f"{n} is {v[row]:g}, which is no temperature in "
+                    f"degrees Celsius{' (kelvin?)' if v[row] > 200 else ''}; convert the column"
+                ),
             )
     spacing = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
     if time[0] < t[0] - spacing or time[-1] > t[-1] + spacing:
@@ -238,8 +248,10 @@ def _ranges(table: Table | None, model: Model, ids: np.ndarray) -> Ranges | None
     distance = table.numbers("range_m", "a distance in m")
     table.check(
         (distance > 0.0) & (distance < 5000.0),
-        lambda row: f"range_m is {distance[row]:g}"
-        + ("; a distance is above 0" if distance[row] <= 0 else ", which looks like mm; give m"),
+        lambda row: (
+            f"range_m is {distance[row]:g}"
+            + ("; a distance is above 0" if distance[row] <= 0 else ", which looks like mm; give m")
+        ),
     )
     return Ranges(epoch, finder, target, point, distance, _sigma(table, model.range_sigma, "m"))
 

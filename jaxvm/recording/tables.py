@@ -50,9 +50,7 @@ class Table:
                 )
         for name in self.frame.columns:
             if name not in known:
-                raise self.error(
-                    None, f'unknown column "{name}"; {did_you_mean(str(name), known)}'
-                )
+                raise self.error(None, f'unknown column "{name}"; {did_you_mean(str(name), known)}')
 
     def numbers(self, column: str, meaning: str) -> Float[np.ndarray, " n"]:
         """A column of finite numbers."""
@@ -60,8 +58,10 @@ class Table:
         values = pd.to_numeric(raw, errors="coerce").to_numpy(float)
         self.check(
             np.isfinite(values),
-            lambda row: f"{column} is {_shown(raw.iloc[row])}; it must be {meaning}, "
-            "mend it or drop the row",
+            lambda row: (
+                f"{column} is {_shown(raw.iloc[row])}; it must be {meaning}, "
+                "mend it or drop the row"
+            ),
         )
         return values
 
@@ -85,8 +85,10 @@ class Table:
         place = np.array([known.get(text, -1) for text in texts], int)
         self.check(
             place >= 0,
-            lambda row: f'{column} "{texts[row]}" is not in {where} {has(known)}; '
-            f"{did_you_mean(texts[row], known)}",
+            lambda row: (
+                f'{column} "{texts[row]}" is not in {where} {has(known)}; '
+                f"{did_you_mean(texts[row], known)}"
+            ),
         )
         return place
 
@@ -99,7 +101,9 @@ def read_table(folder: Path, name: str, required: bool) -> Table | None:
     """
     csv, parquet = folder / f"{name}.csv", folder / f"{name}.parquet"
     if csv.exists() and parquet.exists():
-        raise RecordingError(f"{name}.csv and {name}.parquet are both in {folder}; keep one of them")
+        raise RecordingError(
+            f"{name}.csv and {name}.parquet are both in {folder}; keep one of them"
+        )
     if parquet.exists():
         try:
             frame = pd.read_parquet(parquet)

@@ -49,10 +49,16 @@ class SimulatedRecording:
         """Write the recording (without the truth) into a folder; returns the folder."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "recording.toml").write_text(tomli_w.dumps(self.toml), encoding="utf-8")
-        for name, table in self.recording_tables.items():
-            table.to_csv(folder / f"{name}.csv", index=False, lineterminator="\n")
+        for name, text in self.files().items():
+            (folder / name).write_text(text, encoding="utf-8")
         return folder
+
+    def files(self) -> dict[str, str]:
+        """Content of the recording's files, by name."""
+        files = {"recording.toml": tomli_w.dumps(self.toml)}
+        for name, table in self.recording_tables.items():
+            files[f"{name}.csv"] = table.to_csv(index=False, lineterminator="\n")
+        return files
 
 
 Photographs = dict[tuple[str, str], Float[np.ndarray, "epochs marks 2"]]

@@ -58,9 +58,7 @@ class Arrow(lx.AbstractLinearOperator):
     def add_diagonal(self, values: Float[Array, " n"]) -> "Arrow":
         """The matrix with a diagonal added."""
         a, b = self.split(values)
-        return Arrow(
-            self.shared + jnp.diag(a), self.coupling, self.local + jax.vmap(jnp.diag)(b)
-        )
+        return Arrow(self.shared + jnp.diag(a), self.coupling, self.local + jax.vmap(jnp.diag)(b))
 
     def as_matrix(self) -> Float[Array, "n n"]:
         """The dense matrix, for tests and small problems."""

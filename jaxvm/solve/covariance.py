@@ -72,7 +72,9 @@ def _flat(problem: Problem, x):
 @eqx.filter_jit
 def _inverse_columns(factors: ArrowFactors, columns):
     count = columns.shape[0]
-    return factors.solve(jnp.zeros((factors.arrow.in_size(), count)).at[columns, jnp.arange(count)].set(1.0))
+    return factors.solve(
+        jnp.zeros((factors.arrow.in_size(), count)).at[columns, jnp.arange(count)].set(1.0)
+    )
 
 
 def standard_deviations(adjustment: Adjustment, scale: float = 1.0) -> State:

@@ -2,7 +2,8 @@
 
 optimistix's own least-squares solvers hand a linear solver the whole Jacobian; here the problem
 (`jaxvm.solve.problem.Problem`, passed as `args`) gives its normal equations in arrow form, and
-optimistix's descents (Newton, damped Newton) and searches (learning rate, trust region) do the rest.
+optimistix's descents (Newton, damped Newton) and searches (learning rate, trust region) do the
+rest.
 """
 
 from typing import Any
@@ -14,6 +15,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxvm.solve.arrow import ArrowCholesky
+from jaxvm.solve.problem import normal_at
 
 _HISTORY = 512
 
@@ -52,10 +54,10 @@ class Relaxing(optx.ClassicalTrustRegion):
 class NormalEquationSolver(optx.AbstractLeastSquaresSolver):
     """Least squares by normal equations: a descent, a search, and a statistical stopping rule.
 
-    The problem is passed as `args`. It stops when a hardly damped step changes the cost by no
-    more than `rtol` of itself plus `atol`, up or down, or when damping can't find a lower cost any more. The cost is
-    half a chi-square, so a change of `atol` moves no combination of unknowns by more than
-    sqrt(2 atol) of its standard deviation.
+    The problem is passed as `args`. It stops when a hardly damped step changes the cost by no more
+    than `rtol` of itself plus `atol`, up or down, or when damping can't find a lower cost any more.
+    The cost is half a chi-square, so a change of `atol` moves no combination of unknowns by more
+    than sqrt(2 atol) of its standard deviation.
     """
 
     rtol: float | Float[Array, ""]
@@ -66,7 +68,7 @@ class NormalEquationSolver(optx.AbstractLeastSquaresSolver):
     search: optx.AbstractSearch
 
     def _info(self, y, problem):
-        normal = problem.normal(y)
+        normal = normal_at(problem, y)
         return optx.FunctionInfo.EvalGradHessian(normal.cost, normal.gradient, normal.hessian)
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):

@@ -122,7 +122,7 @@ class Problem(eqx.Module):
         n = factor.slots.shape[0]
         slots = jnp.concatenate(
             [factor.slots, jnp.broadcast_to(effects, (n, effects.shape[0]))], axis=1
-        )[:, jnp.asarray(packets.live)]
+        )[:, jnp.asarray(packets.live, int)]
         moving = jnp.concatenate([self.active, jnp.zeros(1, bool)])[self.column]
         per_unknown = jnp.where(moving, self.factor, 0.0)[slots]
         blocks = block_jacobian(factor, self.network, flat, packets.live)
@@ -187,7 +187,7 @@ def split_columns(columns: Int[Array, "packets live"], sizes: tuple[int, int, in
     offset = jnp.where(is_local, columns - s, 0)
     place = jnp.where(columns < s, columns, s)
     member = jnp.where(is_local, offset % max(d, 1), d)
-    group = jnp.max(jnp.where(is_local, offset // max(d, 1), -1), axis=1)
+    group = jnp.max(jnp.where(is_local, offset // max(d, 1), -1), axis=1, initial=-1)
     return place, jnp.where(group < 0, groups, group), member
 
 

@@ -40,9 +40,9 @@ def half_rows(
     local = _spread(jacobian, member[packet_of], d)
     own = jnp.minimum(group[packet_of], groups - 1)
     local = jnp.where((group[packet_of] < groups)[:, None, None], local, 0.0)
-    solved = jax.vmap(
-        lambda f, rows: jax.scipy.linalg.solve_triangular(f, rows.T, lower=True).T
-    )(factors.local[own], local)
+    solved = jax.vmap(lambda f, rows: jax.scipy.linalg.solve_triangular(f, rows.T, lower=True).T)(
+        factors.local[own], local
+    )
     rest = shared - jnp.einsum("nad,nds->nas", solved, factors.coupled[own])
     reduced = jax.scipy.linalg.solve_triangular(factors.reduced, rest.reshape(-1, s).T, lower=True)
     return jnp.concatenate([solved, reduced.T.reshape(rest.shape)], axis=2)

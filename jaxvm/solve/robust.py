@@ -68,9 +68,18 @@ class TukeyLoss(Loss):
 
     def value(self, square: Squares) -> Squares:
         t2 = jnp.asarray(self.threshold) ** 2
-        inside = jnp.clip(1.0 - square / t2, 0.0, 1.0)
+        inside = jnp.maximum(1.0 - square / t2, 0.0)
         return t2 / 3.0 * (1.0 - inside**3)
 
     def weight(self, square: Squares) -> Squares:
         t2 = jnp.asarray(self.threshold) ** 2
-        return jnp.clip(1.0 - square / t2, 0.0, 1.0) ** 2
+        return jnp.maximum(1.0 - square / t2, 0.0) ** 2
+
+
+LOSSES: dict[str, type[Loss]] = {
+    "squared": SquaredLoss,
+    "huber": HuberLoss,
+    "cauchy": CauchyLoss,
+    "tukey": TukeyLoss,
+}
+"""Losses by name."""

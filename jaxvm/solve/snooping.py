@@ -46,7 +46,8 @@ def _redundancies(problem: Problem, x):
         jacobian = problem.jacobian(factor, packets, flat)
         half = half_rows(factors, packets, jacobian, problem.sizes)
         hat = jnp.einsum("nak,nbk->nab", half, half)
-        result.append(jnp.eye(hat.shape[1]) - hat)
+        counted = (factor.weight > 0.0)[:, None, None]
+        result.append(counted * jnp.eye(hat.shape[1]) - hat)
     return result
 
 

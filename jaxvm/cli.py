@@ -1,0 +1,275 @@
+"""Commands. Each is a thin wrapper of a function that a notebook calls."""
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from jaxvm import __version__
+
+BAD_INPUT = 2
+INTERRUPTED = 130
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run a command; returns the exit status (0 done, 2 bad input, 130 interrupted)."""
+    options = _parser().parse_args(arguments)
+    try:
+        answer, text = options.run(options)
+    except KeyboardInterrupt:
+        print("interrupted; no output was begun", file=sys.stderr)
+        return INTERRUPTED
+    except (ValueError, OSError) as problem:
+        # Every foreseen complaint is a ValueError or OSError whose message names the mend.
+        print(f"jaxvm {options.command}: {problem}", file=sys.stderr)
+        return BAD_INPUT
+    print(json.dumps(answer, indent=1, allow_nan=False) if options.json else text)
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="jaxvm",
+        description="Measure with networks of cameras, and find the physics that a model left out.",
+    )
+    parser.add_argument("--version", action="version", version=f"jaxvm {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    def command(name: str, run: Callable, words: str) -> argparse.ArgumentParser:
+        own = commands.add_parser(name, help=words, description=words)
+        own.set_defaults(run=run)
+        own.add_argument("--json", action="store_true", help="print the answer as JSON")
+        own.add_argument("--quiet", action="store_true", help="no progress")
+        return own
+
+    demo = command("demo", _demo, "hide physics in a simulated recording and find it")
+    demo.add_argument("--seed", type=_natural, default=1, help="draws scene, noise and effect")
+    demo.add_argument(
+        "--hide",
+        default=None,
+        metavar="EFFECT",
+        help='effects to hide, with commas; "nothing"; drawn by the seed if not given',
+    )
+    demo.add_argument("--size", choices=("full", "small"), default="full")
+    demo.add_argument("--out", type=Path, default=Path("jaxvm-demo"), metavar="DIR")
+
+    diagnose = command("diagnose", _diagnose, "find the physics that a model left out")
+    _recording_argument(diagnose)
+    diagnose.add_argument("--out", type=Path, default=Path("jaxvm-report"), metavar="DIR")
+    diagnose.add_argument("--every", type=_natural, default=3, help="hold out every n-th epoch")
+    diagnose.add_argument("--alpha", type=float, default=0.01, help="risk of a false claim")
+    diagnose.add_argument("--seed", type=_natural, default=0, help="of sign-flips and bootstrap")
+
+    adjust = command("adjust", _adjust, "least-squares adjustment of a recording")
+    _recording_argument(adjust)
+    adjust.add_argument("--out", type=Path, default=None, metavar="DIR")
+    adjust.add_argument(
+        "--method",
+        choices=("levenberg-marquardt", "gauss-newton"),
+        default="levenberg-marquardt",
+    )
+    adjust.add_argument(
+        "--loss", choices=("squared", "huber", "cauchy", "tukey"), default="squared"
+    )
+
+    simulate = command("simulate", _simulate, "write a simulated recording")
+    simulate.add_argument("scene", choices=("deformation",), help="what to simulate")
+    simulate.add_argument("--out", type=Path, required=True, metavar="RECORDING")
+    simulate.add_argument(
+        "--hide", default="nothing", metavar="EFFECT", help="effects, with commas"
+    )
+    simulate.add_argument("--seed", type=_natural, default=0)
+    simulate.add_argument("--size", choices=("full", "small"), default="full")
+    simulate.add_argument("--strength", type=float, default=1.0, help="factor on every effect")
+
+    convert = command("convert", _convert, "make a recording of other programs' files")
+    convert.add_argument(
+        "source",
+        help="table of corners (.csv), mrcal's corners (.vnl) or .cameramodel, OpenCV's calibration "
+        "(.yml, .xml), the folder of a recording, or the name of a public one",
+    )
+    convert.add_argument("--out", type=Path, required=True, metavar="RECORDING")
+    convert.add_argument("--table", choices=("csv", "parquet"), default="csv")
+    convert.add_argument("--image-size", type=_size, default=None, metavar="WxH")
+    convert.add_argument("--spacing", type=float, default=None, metavar="METRES")
+    convert.add_argument("--rows", type=_natural, default=None)
+    convert.add_argument("--columns", type=_natural, default=None)
+    convert.add_argument("--lens", default="opencv8")
+
+    validate = command("validate", _validate, "check a recording and tell what is in it")
+    _recording_argument(validate)
+    return parser
+
+
+def _recording_argument(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("recording", help="folder of a recording, or the name of a public one")
+    parser.add_argument(
+        "--model", type=Path, default=None, metavar="FILE", help="in place of its recording.toml"
+    )
+
+
+def _natural(text: str) -> int:
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"{text} is negative")
+    return value
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, _, height = text.partition("x")
+    if not (width.isdecimal() and height.isdecimal()):
+        raise argparse.ArgumentTypeError(f"{text} is not like 6016x4016")
+    return int(width), int(height)
+
+
+def _progress(options) -> Callable[[str], None]:
+    """Lines with the elapsed time on stderr."""
+    began = time.perf_counter()
+
+    def line(text: str) -> None:
+        if not options.quiet:
+            print(f"{time.perf_counter() - began:6.1f} s  {text}", file=sys.stderr, flush=True)
+
+    return line
+
+
+def _keep_compiled() -> None:
+    """Compiled programs stay on disk, so that a second run starts at once."""
+    import jax
+    from platformdirs import user_cache_path
+
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        folder = user_cache_path("jaxvm") / f"compiled-{jax.__version__}"
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def _open(options):
+    """The recording that a command is about: a folder, or a public one by name."""
+    from jaxvm.recording import DATASETS, open_recording, read_recording
+
+    if options.recording in DATASETS and not Path(options.recording).exists():
+        return open_recording(options.recording, options.model)
+    return read_recording(options.recording, options.model)
+
+
+def _report(diagnosis, out: Path) -> tuple[dict[str, Any], str]:
+    from jaxvm.report import document, summary, write_report
+
+    page = write_report(diagnosis, out)
+    answer = document(diagnosis) | {"report": str(page)}
+    return answer, f"{summary(diagnosis)}\n\nreport     {page}"
+
+
+def _demo(options):
+    from jaxvm.demo import demo, paragraph
+
+    _keep_compiled()
+    shown = demo(options.seed, options.hide, options.size, options.out, _progress(options))
+    answer, text = _report(shown.diagnosis, options.out)
+    answer["hidden"] = [truth.effect for truth in shown.truth]
+    answer["paragraph"] = paragraph(shown, options.out / "report.html")
+    return answer, f"{text}\n\n{answer['paragraph']}"
+
+
+def _diagnose(options):
+    from jaxvm.discover import diagnose
+
+    _keep_compiled()
+    if not 0.0 < options.alpha < 1.0:
+        raise ValueError(f"--alpha is {options.alpha:g}; it is a probability between 0 and 1")
+    recording = _open(options)
+    found = diagnose(
+        recording,
+        every=options.every,
+        alpha=options.alpha,
+        seed=options.seed,
+        progress=_progress(options),
+    )
+    return _report(found, options.out)
+
+
+def _adjust(options):
+    from jaxvm.network.estimate import estimated_model, pose_table
+    from jaxvm.network.scene import build
+    from jaxvm.network.start import start
+    from jaxvm.recording import model_text
+    from jaxvm.recording.files import write_files
+    from jaxvm.solve.adjust import adjust, pixel_rms
+    from jaxvm.solve.covariance import standard_deviations
+    from jaxvm.solve.robust import LOSSES
+
+    _keep_compiled()
+    progress = _progress(options)
+    progress("start values from the data")
+    scene = start(build(_open(options)))
+    progress("adjustment")
+    result = adjust(scene, options.method, LOSSES[options.loss]())
+    deviations = standard_deviations(result, result.variance_factor)
+    answer = {
+        "cost_before": result.cost_before,
+        "cost": result.cost,
+        "variance_factor": result.variance_factor,
+        "degrees_of_freedom": result.degrees_of_freedom,
+        "pixel_rms_px": pixel_rms(result.scene, result.residuals()),
+        "evaluations": result.evaluations,
+        "why": result.why,
+        "seconds": result.seconds,
+    }
+    text = result.summary()
+    if options.out is not None:
+        files = {
+            "adjustment.json": json.dumps(answer, indent=1) + "\n",
+            "model.toml": model_text(estimated_model(result.scene)),
+            "poses.csv": pose_table(result.scene, deviations).to_csv(index=False),
+        }
+        write_files(options.out, files)
+        text += f"\nwritten            {options.out}: {', '.join(files)}"
+    return answer, text
+
+
+def _simulate(options):
+    from jaxvm.demo import hidden_keys
+    from jaxvm.recording.files import new_folder
+    from jaxvm.simulate import simulate_deformation_scene
+
+    made = simulate_deformation_scene(
+        hidden_keys(options.hide), options.seed, options.size, options.strength
+    )
+    with new_folder(options.out) as staging:
+        made.write(staging)
+    hidden = " ".join(truth.sentence for truth in made.truth) or "nothing"
+    answer = {"recording": str(options.out), "hidden": [truth.effect for truth in made.truth]}
+    return answer, f"written    {options.out}\nhidden     {hidden}"
+
+
+def _convert(options):
+    from jaxvm.recording import convert
+
+    told = convert(
+        options.source,
+        options.out,
+        table=options.table,
+        image_size=options.image_size,
+        spacing_m=options.spacing,
+        rows=options.rows,
+        columns=options.columns,
+        lens=options.lens,
+    )
+    return {"recording": str(options.out), "contents": told}, f"written    {options.out}: {told}"
+
+
+def _validate(options):
+    from jaxvm.recording import describe
+
+    told = describe(_open(options))
+    return {"valid": True, "contents": told}, f"valid      {told}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

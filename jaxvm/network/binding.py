@@ -1,0 +1,146 @@
+"""Bind the effects of a scene to its tables: patterns, scopes, and priors of amplitudes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxvm.network.factors import PixelFactor, PriorFactor
+from jaxvm.network.residual import Network, parts_of
+from jaxvm.network.tables import Tables
+from jaxvm.physics.chain import Sight
+from jaxvm.physics.drivers import all_observation_drivers, pattern
+from jaxvm.physics.effects import Scope, courses
+from jaxvm.physics.forms import FORMS
+from jaxvm.physics.ports import PORTS, PortValues
+
+if TYPE_CHECKING:
+    from jaxvm.network.scene import Scene
+
+
+def bind(scene: Scene) -> Scene:
+    """Compute the patterns of the effects over the tables, at the present geometry."""
+    network = scene.network
+    n_columns = network.effects.n_columns
+    pixels = []
+    for factor, rows in zip(network.pixels, scene.tables, strict=True):
+        patterns = np.zeros((factor.slots.shape[0], n_columns))
+        if scene.effects:
+            drivers = observation_driver_table(scene, factor, rows)
+            column = 0
+            for effect in scene.effects:
+                inside = in_scope(scene, effect.scope, rows)
+                for term in effect.terms:
+                    n = len(FORMS[effect.form].bases)
+                    own = np.asarray(pattern(term, drivers))[: len(rows)] * inside
+                    patterns[: len(rows), column : column + n] = own[:, None]
+                    column += n
+        pixels.append(eqx.tree_at(lambda f: f.pattern, factor, jnp.asarray(patterns)))
+    network = eqx.tree_at(lambda n: n.pixels, network, tuple(pixels))
+    if network.ranges is not None:
+        patterns = np.zeros((len(network.ranges.epoch), n_columns))
+        column = 0
+        for effect in scene.effects:
+            inside = ranges_in_scope(scene, effect.scope)
+            for term in effect.terms:
+                n = len(FORMS[effect.form].bases)
+                # A pattern over the image says nothing about a rangefinder's beam.
+                patterns[:, column : column + n] = (inside * (term.driver == "one"))[:, None]
+                column += n
+        network = eqx.tree_at(lambda n: n.ranges.pattern, network, jnp.asarray(patterns))
+    return replace(scene, network=_with_amplitude_priors(scene, network))
+
+
+def _with_amplitude_priors(scene: Scene, network: Network) -> Network:
+    """Priors that keep every amplitude of physical size, so that none is undetermined.
+
+    The width is the largest plausible perturbation of the port over the largest value that the
+    column takes; against any real evidence it weighs nothing.
+    """
+    n_columns = network.effects.n_columns
+    given = Tables(scene).priors()
+    if n_columns == 0:
+        return replace(network, priors=given)
+    reach = np.zeros(n_columns)
+    tables = [*network.pixels, *([] if network.ranges is None else [network.ranges])]
+    for factor in tables:
+        reach = np.maximum(reach, np.abs(np.asarray(factor.pattern)).max(axis=0, initial=0.0))
+    own = np.asarray(_courses(network.effects, scene.state.constant, network.channels))
+    reach = reach * np.abs(own).max(axis=1)
+    largest = np.abs(np.asarray(network.effects.ports)).T > 0
+    limit = np.where(largest, np.array([port.largest for port in PORTS])[:, None], 0.0).max(axis=0)
+    used = (reach > 0) & (limit > 0)
+    slots = network.layout.all("amplitude")
+    sigma = np.where(used, limit, 1.0) / np.where(used, reach, 1.0)
+    own_priors = PriorFactor(
+        slots=jnp.asarray(slots[:, None]),
+        sigma=jnp.asarray(sigma[:, None]),
+        weight=jnp.asarray(used, float),
+        expected=jnp.zeros(n_columns),
+    )
+    if given is None:
+        return replace(network, priors=own_priors)
+    both = jax.tree.map(lambda a, b: jnp.asarray(np.concatenate([a, b])), given, own_priors)
+    return replace(network, priors=both)
+
+
+_courses = eqx.filter_jit(courses)
+
+
+def observation_driver_table(scene: Scene, factor: PixelFactor, rows: np.ndarray):
+    """Observation-like drivers of a pixel table at the scene's present state."""
+    sizes = np.array([c.image_size for c in scene.model.cameras], float)
+    padded = np.append(rows, np.full(factor.slots.shape[0] - len(rows), rows[-1]))
+    size = jnp.asarray(sizes[scene.recording.observations.camera[padded]])
+    up = jnp.asarray(scene.model.up, float)
+    return _driver_table(factor, scene.state.flatten(), size, up)
+
+
+@eqx.filter_jit
+def _driver_table(factor: PixelFactor, flat, size, up):
+    own = parts_of(factor, flat)
+    plain = jax.vmap(lambda o, at: factor.local(o, at, PortValues()) + at.pixel)
+    predicted = plain(own, factor.circumstances)
+    return all_observation_drivers(Sight(*own), factor.circumstances, predicted, size, up)
+
+
+def in_scope(scene: Scene, scope: Scope, rows: np.ndarray) -> np.ndarray:
+    """1.0 for the observations (rows of the recording) that a scope touches."""
+    obs, model = scene.recording.observations, scene.model
+    if scope.rangefinder:
+        return np.zeros(len(rows))
+    camera_ok = np.array(
+        [
+            (not scope.camera or c.name in scope.camera)
+            and (not scope.station or c.station in scope.station)
+            for c in model.cameras
+        ]
+    )
+    target_ok = np.array([not scope.target or t.name in scope.target for t in model.targets])
+    inside = camera_ok[obs.camera[rows]] & target_ok[obs.target[rows]]
+    if scope.point:
+        names = np.concatenate([np.array(t.point_names, object) for t in model.targets])
+        mine = np.isin(names.astype(str), scope.point)
+        inside &= mine[scene.first_point[obs.target[rows]] + obs.point[rows]]
+    return inside.astype(float)
+
+
+def ranges_in_scope(scene: Scene, scope: Scope) -> np.ndarray:
+    """1.0 for the ranges that a scope touches."""
+    ranges, model = scene.recording.ranges, scene.model
+    if ranges is None or scope.camera or scope.point:
+        return np.zeros(0 if ranges is None else len(ranges.epoch))
+    finder_ok = np.array(
+        [
+            (not scope.rangefinder or r.name in scope.rangefinder)
+            and (not scope.station or r.station in scope.station)
+            for r in model.rangefinders
+        ]
+    )
+    target_ok = np.array([not scope.target or t.name in scope.target for t in model.targets])
+    return (finder_ok[ranges.rangefinder] & target_ok[ranges.target]).astype(float)

@@ -1,0 +1,243 @@
+"""The tables of a network: names and indices of a recording become slots of the flat state."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxvm.geometry.lenses import lens_family
+from jaxvm.network.factors import (
+    ClosureFactor,
+    EdgeFactor,
+    LinkFactor,
+    PixelFactor,
+    PriorFactor,
+    RangeFactor,
+    rounded,
+)
+from jaxvm.physics.chain import Circumstances
+
+if TYPE_CHECKING:
+    from jaxvm.network.scene import Scene
+
+
+class Tables:
+    """Turns the names and indices of a recording into slots of the flat state."""
+
+    def __init__(self, scene: Scene):
+        self.recording = scene.recording
+        self.model = scene.model
+        self.layout = scene.network.layout
+        self.station_row = scene.station_row
+        self.target_row = scene.target_row
+        self.first_point = scene.first_point
+        names = [s.name for s in self.model.stations]
+        self.station_of = np.array([names.index(c.station) for c in self.model.cameras], int)
+        self.station_of_finder = np.array(
+            [names.index(r.station) for r in self.model.rangefinders], int
+        )
+        # A target whose marks are unknown has no middle and no size yet.
+        points = [
+            t.points if np.isfinite(t.points).all() else np.zeros((1, 3))
+            for t in self.model.targets
+        ]
+        self.centre = np.array([(p.min(0) + p.max(0)) / 2 for p in points])
+        half = np.array([np.ptp(p, axis=0)[:2] / 2 for p in points])
+        self.half_size = np.where(half > 0, half, 1.0)
+
+    def circumstances(self, epoch, target, pixel, height) -> Circumstances:
+        velocity = np.zeros((len(epoch), 6))
+        for name, values in self.recording.velocities.items():
+            own = target == [t.name for t in self.model.targets].index(name)
+            velocity[own] = values[epoch[own]]
+        return Circumstances(
+            *map(
+                jnp.asarray,
+                (pixel, height, self.centre[target], self.half_size[target], velocity),
+            )
+        )
+
+    def pixel_tables(self):
+        """One table for each family of lenses; rows sorted so that equal slots are neighbours."""
+        obs = self.recording.observations
+        lenses = [c.lens for c in self.model.cameras]
+        tables, factors = [], []
+        for lens in dict.fromkeys(lenses):
+            family = lens_family(lens)
+            of_lens = np.array([name == lens for name in lenses])
+            chosen = np.flatnonzero(of_lens[obs.camera])
+            order = np.lexsort(
+                (obs.point[chosen], obs.target[chosen], obs.camera[chosen], obs.epoch[chosen])
+            )
+            chosen = chosen[order]
+            if len(chosen) == 0:
+                continue
+            real = len(chosen)
+            tables.append(chosen)
+            chosen = np.append(chosen, np.full(rounded(real) - real, chosen[-1]))
+            camera, target = obs.camera[chosen], obs.target[chosen]
+            epoch, point = obs.epoch[chosen], self.first_point[target] + obs.point[chosen]
+            slots = [
+                self.layout.slots("focal", camera),
+                self.layout.slots("centre", camera),
+                self.layout.slots("distortion", camera, family.n_coefficients),
+                self.layout.slots("station_from_camera", camera),
+                self.layout.slots(
+                    "world_from_station", self.station_row[self.station_of[camera], epoch]
+                ),
+                self.layout.slots("world_from_target", self.target_row[target, epoch]),
+                self.layout.slots("point", point),
+            ]
+            height = np.array([c.image_size[1] for c in self.model.cameras], float)[camera]
+            sigma = np.repeat(obs.sigma[chosen][:, None], 2, axis=1)
+            factors.append(
+                PixelFactor(
+                    family=family,
+                    slots=jnp.asarray(np.concatenate(slots, axis=1)),
+                    sigma=jnp.asarray(sigma),
+                    weight=jnp.asarray(np.arange(len(chosen)) < real, float),
+                    real=jnp.asarray(real),
+                    circumstances=self.circumstances(epoch, target, obs.pixel[chosen], height),
+                    epoch=jnp.asarray(epoch),
+                    pattern=jnp.zeros((len(chosen), 0)),
+                )
+            )
+        return tuple(tables), tuple(factors)
+
+    def ranges(self) -> RangeFactor | None:
+        ranges = self.recording.ranges
+        if ranges is None or len(ranges.epoch) == 0:
+            return None
+        to_plane = ranges.point < 0
+        point = self.first_point[ranges.target] + np.maximum(ranges.point, 0)
+        station = self.station_of_finder[ranges.rangefinder]
+        slots = [
+            self.layout.slots("station_from_rangefinder", ranges.rangefinder),
+            self.layout.slots("world_from_station", self.station_row[station, ranges.epoch]),
+            self.layout.slots("world_from_target", self.target_row[ranges.target, ranges.epoch]),
+            self.layout.slots("point", point),
+        ]
+        n = len(ranges.epoch)
+        return RangeFactor(
+            slots=jnp.asarray(np.concatenate(slots, axis=1)),
+            sigma=jnp.asarray(ranges.sigma[:, None]),
+            weight=jnp.ones(n),
+            circumstances=self.circumstances(
+                ranges.epoch, ranges.target, np.zeros((n, 2)), np.ones(n)
+            ),
+            to_plane=jnp.asarray(to_plane, float),
+            measured=jnp.asarray(ranges.distance),
+            epoch=jnp.asarray(ranges.epoch),
+            pattern=jnp.zeros((n, 0)),
+        )
+
+    def _node(self, kind: str, number: int, epoch: int) -> np.ndarray:
+        """Slots of a node: carrier, then body on the carrier."""
+        epoch = max(epoch, 0)
+        identity = self.layout.slots("identity", np.zeros(1, int))[0]
+        if kind == "camera":
+            row = self.station_row[self.station_of[number], epoch]
+            carrier = self.layout.slots("world_from_station", np.array([row]))[0]
+            body = self.layout.slots("station_from_camera", np.array([number]))[0]
+            return np.concatenate([carrier, body])
+        rows, table = {
+            "station": (self.station_row, "world_from_station"),
+            "target": (self.target_row, "world_from_target"),
+        }[kind]
+        own = self.layout.slots(table, np.array([rows[number, epoch]]))[0]
+        return np.concatenate([own, identity])
+
+    def _split_links(self):
+        links = self.recording.links
+        closed = {name for closure in self.model.closures for name, _ in closure.links}
+        inside = [] if links is None else [name in closed for name in links.name]
+        return links, np.array(inside, bool)
+
+    def links(self) -> LinkFactor | None:
+        """Every link joins its bodies. Links of a closure are adjusted on their own, too."""
+        links = self.recording.links
+        if links is None or len(links.name) == 0:
+            return None
+        rows = np.arange(len(links.name))
+        slots = [
+            np.concatenate(
+                [
+                    self._node(*links.from_node[i], links.epoch[i]),
+                    self._node(*links.to_node[i], links.epoch[i]),
+                ]
+            )
+            for i in rows
+        ]
+        return LinkFactor(
+            slots=jnp.asarray(np.stack(slots)),
+            sigma=jnp.asarray(_pose_sigma(links.sigma_rad[rows], links.sigma_m[rows])),
+            weight=jnp.ones(len(rows)),
+            measured=jnp.asarray(links.pose[rows]),
+        )
+
+    def closed_links(self) -> tuple[EdgeFactor | None, ClosureFactor | None]:
+        links, inside = self._split_links()
+        rows = np.flatnonzero(inside)
+        if links is None or len(rows) == 0:
+            return None, None
+        place = {links.name[i]: k for k, i in enumerate(rows)}
+        edges = EdgeFactor(
+            slots=jnp.asarray(self.layout.slots("link", np.arange(len(rows)))),
+            sigma=jnp.asarray(_pose_sigma(links.sigma_rad[rows], links.sigma_m[rows])),
+            weight=jnp.ones(len(rows)),
+            measured=jnp.asarray(links.pose[rows]),
+        )
+        closures = self.model.closures
+        longest = max(len(closure.links) for closure in closures)
+        identity = self.layout.slots("identity", np.zeros(1, int))[0]
+        slots = np.tile(identity, (len(closures), longest))
+        forward = np.ones((len(closures), longest))
+        for i, closure in enumerate(closures):
+            for k, (name, sign) in enumerate(closure.links):
+                own = self.layout.slots("link", np.array([place[name]]))[0]
+                slots[i, 6 * k : 6 * k + 6] = own
+                forward[i, k] = sign
+        sigma = _pose_sigma(
+            np.array([c.sigma_rad for c in closures]), np.array([c.sigma_m for c in closures])
+        )
+        return edges, ClosureFactor(
+            slots=jnp.asarray(slots),
+            sigma=jnp.asarray(sigma),
+            weight=jnp.ones(len(closures)),
+            forward=jnp.asarray(forward),
+        )
+
+    def priors(self) -> PriorFactor | None:
+        slots, expected, sigma = [], [], []
+        for prior in self.model.priors:
+            kind, name, quantity = prior.parameter.split(".")
+            bodies = {"cameras": self.model.cameras, "stations": self.model.stations}
+            body = [b.name for b in bodies.get(kind, self.model.targets)].index(name)
+            width = len(prior.value)
+            if kind == "cameras":
+                table = "station_from_camera" if quantity == "pose" else quantity
+                rows = np.array([body])
+            else:
+                of_body = self.station_row if kind == "stations" else self.target_row
+                table = "world_from_station" if kind == "stations" else "world_from_target"
+                rows = np.unique(of_body[body])
+            slots.append(self.layout.slots(table, rows, width).ravel())
+            expected.append(np.tile(prior.value, len(rows)))
+            sigma.append(np.tile(prior.sigma, len(rows)))
+        if not slots:
+            return None
+        flat = np.concatenate(slots)
+        return PriorFactor(
+            slots=jnp.asarray(flat[:, None]),
+            sigma=jnp.asarray(np.concatenate(sigma)[:, None]),
+            weight=jnp.ones(len(flat)),
+            expected=jnp.asarray(np.concatenate(expected)),
+        )
+
+
+def _pose_sigma(sigma_rad: np.ndarray, sigma_m: np.ndarray) -> np.ndarray:
+    return np.concatenate(
+        [np.repeat(sigma_rad[:, None], 3, axis=1), np.repeat(sigma_m[:, None], 3, axis=1)], axis=1
+    )

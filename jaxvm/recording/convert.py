@@ -1,0 +1,104 @@
+"""Convert files of other programs, or another kind of table, into the folder of a recording."""
+
+from pathlib import Path
+from typing import Literal
+
+import tomli_w
+
+from jaxvm.recording.datasets import DATASETS, open_recording
+from jaxvm.recording.errors import RecordingError
+from jaxvm.recording.files import new_folder
+from jaxvm.recording.importers import (
+    import_cameramodel,
+    import_corner_table,
+    import_corners_vnl,
+    import_opencv_calibration,
+)
+from jaxvm.recording.model import camera_table
+from jaxvm.recording.read import read_recording
+from jaxvm.recording.recording import Recording
+from jaxvm.recording.write import write_recording
+
+
+def convert(
+    source: str | Path,
+    out: str | Path,
+    table: Literal["csv", "parquet"] = "csv",
+    image_size: tuple[int, int] | None = None,
+    spacing_m: float | None = None,
+    rows: int | None = None,
+    columns: int | None = None,
+    lens: str = "opencv8",
+) -> str:
+    """Write a recording made of `source`; returns a sentence that tells what is in it.
+
+    What the source is follows from its name: .csv is a table of corners, .vnl mrcal's corners,
+    .cameramodel mrcal's optimisation inputs, a folder a recording, and the name of a public
+    recording that one. OpenCV's calibration (.yml, .yaml, .xml) has no observations: `out` gets a
+    recording.toml with its cameras, to which targets and tables are to be added.
+
+    Raises:
+        RecordingError: the source is wrong, or needs a number that was not given.
+        FileExistsError: `out` is already there and not empty.
+    """
+    path = Path(source)
+    kind = "folder" if path.is_dir() else path.suffix.lower()
+
+    def needed(value, option: str):
+        if value is None:
+            raise RecordingError(f"{path.name}: it does not tell {option}; give it")
+        return value
+
+    if kind in (".yml", ".yaml", ".xml"):
+        cameras = import_opencv_calibration(path, image_size)
+        content = {"format": 1, "cameras": {c.name: camera_table(c) for c in cameras}}
+        with new_folder(out) as staging:
+            (staging / "recording.toml").write_text(tomli_w.dumps(content), encoding="utf-8")
+        return f"{len(cameras)} calibrated cameras; add targets and tables"
+    if str(source) in DATASETS and kind != "folder":
+        recording = open_recording(str(source))
+    elif kind == "folder":
+        recording = read_recording(path)
+    elif kind == ".csv":
+        size = needed(image_size, "the image size")
+        recording = import_corner_table(path, size, needed(spacing_m, "the spacing (m)"), lens)
+    elif kind == ".vnl":
+        recording = import_corners_vnl(
+            path,
+            needed(rows, "the number of rows"),
+            needed(columns, "the number of columns"),
+            needed(spacing_m, "the spacing (m)"),
+            {"camera": needed(image_size, "the image size")},
+            lens=lens,
+        )
+    elif kind == ".cameramodel":
+        recording = import_cameramodel(path)
+    else:
+        raise RecordingError(
+            f"{source}: it is no folder, no public recording ({', '.join(DATASETS)}), and no .csv, "
+            ".vnl, .cameramodel, .yml or .xml file; mend the name"
+        )
+    write_recording(recording, out, table)
+    return describe(recording)
+
+
+def describe(recording: Recording) -> str:
+    """What is in a recording, in one sentence."""
+    model = recording.model
+    parts = [
+        f"{len(model.cameras)} camera(s) on {len(model.stations)} station(s)",
+        f"{len(model.targets)} target(s)",
+        f"{len(recording.time)} epochs",
+        f"{len(recording.observations.epoch)} image points",
+    ]
+    if recording.timed and len(recording.time) > 1:
+        parts[2] += f" over {(recording.time[-1] - recording.time[0]) / 3600.0:.2f} h"
+    if recording.drivers is not None:
+        parts.append(f"drivers {', '.join(recording.drivers.channels)}")
+    if recording.ranges is not None:
+        parts.append(f"{len(recording.ranges.epoch)} ranges")
+    if recording.links is not None:
+        parts.append(f"{len(recording.links.name)} links")
+    if model.effects:
+        parts.append("effects " + ", ".join(effect.name for effect in model.effects))
+    return "; ".join(parts)

@@ -1,0 +1,91 @@
+"""The diagnosis as a document: report.json, and the extended model as recording.toml."""
+
+from typing import Any
+
+import numpy as np
+
+from jaxvm.discover.diagnose import Diagnosis, Finding
+from jaxvm.discover.select import Rival
+from jaxvm.report.words import Parameter, explanation, parameters, separate_by, when
+
+FORMAT = 1
+
+
+def document(diagnosis: Diagnosis) -> dict[str, Any]:
+    """Content of report.json (DESIGN: format 1); plain numbers and texts only."""
+    return {
+        "format": FORMAT,
+        "recording": diagnosis.recording.model.name,
+        "verdict": diagnosis.verdict,
+        "noise_px": diagnosis.noise_px,
+        "plain": vars(diagnosis.plain),
+        "final": vars(diagnosis.final),
+        "findings": [_finding(finding) for finding in diagnosis.findings],
+        "left_over": {
+            "significant": diagnosis.significant_left,
+            "p_value": diagnosis.left_p_value,
+            "unproven": diagnosis.unproven,
+            "located": [vars(place) for place in diagnosis.located_left],
+        },
+        "located_before": [vars(place) for place in diagnosis.located_before],
+        "n_hypotheses": diagnosis.n_hypotheses,
+        "n_rejected": diagnosis.n_rejected,
+        "heldout_epochs": diagnosis.recording.epoch_ids[diagnosis.held].tolist(),
+        "smallest_visible": {
+            name: {"amplitude": _number(value), "unit": unit}
+            for name, (value, unit) in sorted(diagnosis.smallest.items())
+        },
+        "seconds": diagnosis.seconds,
+    }
+
+
+def _finding(finding: Finding) -> dict[str, Any]:
+    effect, gain = finding.effect, finding.gain
+    return {
+        "physics": effect.name,
+        "catalogue_id": effect.catalogue_id,
+        "named": bool(finding.hypothesis.entries),
+        "port": effect.terms[0].port,
+        "terms": [{"port": t.port, "pattern": t.driver, "basis": t.basis} for t in effect.terms],
+        "driver": effect.driver,
+        "form": effect.form,
+        "where": effect.scope.as_dict(),
+        "when": when(effect),
+        "parameters": _parameters(parameters(effect, finding.stds)),
+        "final_parameters": _parameters(parameters(finding.final_effect, finding.final_stds)),
+        "share_of_excess": finding.share,
+        "p_value": finding.p_value,
+        "n_hypotheses": finding.n_hypotheses,
+        "weight": finding.weight,
+        "equivalents": [_rival(rival) for rival in finding.rivals],
+        "separate_by": separate_by(finding),
+        "explanation": explanation(finding),
+        "heldout_rms_px": {"before": gain.before_px, "after": gain.after_px},
+        "heldout_share": {"value": gain.share, "interval_95": list(gain.interval)},
+        "ranking": [{"hypothesis": words, "evidence": _number(e)} for words, e in finding.ranking],
+    }
+
+
+def _rival(rival: Rival) -> dict[str, Any]:
+    effect = rival.hypothesis.effect(())
+    return {
+        "physics": effect.name,
+        "catalogue_id": effect.catalogue_id,
+        "port": effect.terms[0].port,
+        "driver": effect.driver,
+        "form": effect.form,
+        "where": effect.scope.as_dict(),
+        "weight": rival.weight,
+    }
+
+
+def _parameters(values: list[Parameter]) -> list[dict[str, Any]]:
+    return [
+        {"name": p.name, "value": _number(p.value), "std": _number(p.std), "unit": p.unit}
+        for p in values
+    ]
+
+
+def _number(value: float) -> float | None:
+    """JSON has no NaN and no infinity."""
+    return float(value) if np.isfinite(value) else None

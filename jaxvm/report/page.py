@@ -1,0 +1,73 @@
+"""Write a diagnosis: report.html, report.json, model.toml and figures, all or none."""
+
+import base64
+import json
+from pathlib import Path
+
+from jinja2 import Environment, PackageLoader, select_autoescape
+
+from jaxvm import __version__
+from jaxvm.discover.diagnose import Diagnosis
+from jaxvm.network.estimate import estimated_model
+from jaxvm.recording.files import write_files
+from jaxvm.recording.write import model_text
+from jaxvm.report.document import document
+from jaxvm.report.figures import figures, png
+from jaxvm.report.words import (
+    explanation,
+    in_pixels,
+    mistaken_for,
+    parameters,
+    quantity,
+    separate_by,
+    size,
+    verdict_sentence,
+    when,
+)
+
+
+def write_report(diagnosis: Diagnosis, folder: str | Path) -> Path:
+    """Write everything about a diagnosis into a folder; returns the path of report.html.
+
+    Files of an earlier report are replaced, each when its successor is complete.
+    """
+    pictures = {f"{name}.png": png(figure) for name, figure in figures(diagnosis).items()}
+    files: dict[str, str | bytes] = {
+        **pictures,
+        "report.json": json.dumps(document(diagnosis), indent=1, allow_nan=False) + "\n",
+        "model.toml": model_text(estimated_model(diagnosis.scene)),
+        "report.html": html(diagnosis, pictures),
+    }
+    write_files(folder, files)
+    return Path(folder) / "report.html"
+
+
+def html(diagnosis: Diagnosis, pictures: dict[str, bytes]) -> str:
+    """The page, with its pictures inside."""
+    environment = Environment(
+        loader=PackageLoader("jaxvm.report"), autoescape=select_autoescape(), trim_blocks=True
+    )
+    encoded = {
+        name.removesuffix(".png"): "data:image/png;base64," + base64.b64encode(data).decode()
+        for name, data in pictures.items()
+    }
+    words = {
+        "explanation": explanation,
+        "in_pixels": in_pixels,
+        "mistaken_for": mistaken_for,
+        "parameters": parameters,
+        "quantity": quantity,
+        "separate_by": separate_by,
+        "size": size,
+        "when": when,
+    }
+    smallest = sorted(diagnosis.smallest.items())
+    return environment.get_template("report.html.j2").render(
+        d=diagnosis,
+        model=diagnosis.recording.model,
+        verdict=verdict_sentence(diagnosis),
+        picture=encoded,
+        smallest=[(name, quantity(value, 0.0, unit)) for name, (value, unit) in smallest],
+        version=__version__,
+        **words,
+    )

@@ -1,0 +1,230 @@
+"""A finding in words and numbers: parameters with units, sizes that can be read, when and where."""
+
+import math
+import re
+from dataclasses import dataclass
+
+from jaxvm.discover.diagnose import Diagnosis, Finding
+from jaxvm.physics.effects import Effect
+from jaxvm.physics.forms import FORMS
+from jaxvm.physics.ports import PORTS
+
+_PORT = {port.name: port for port in PORTS}
+
+_PER_DRIVER = {"linear": 1, "lag": 1, "slow lag": 1, "play": 1, "square": 2, "ramp": 1, "rate": 1}
+"""Power of the driver's unit under the unit of an amplitude, by basis."""
+
+_UNITS = (("degC", "K"), ("K_per_m", "K/m"), ("W_m2", "W/m²"), ("pct", "%"), ("hPa", "hPa"))
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number of a finding: value and standard deviation in `unit`."""
+
+    name: str
+    value: float
+    std: float
+    unit: str
+
+
+def driver_unit(driver: str) -> str:
+    """Unit of a driver, from the end of its name (temperature differences are in K)."""
+    if driver.startswith("time"):
+        return "s"
+    for ending, unit in _UNITS:
+        if driver.endswith(ending):
+            return unit
+    return driver
+
+
+def parameters(effect: Effect, stds: tuple[float, ...]) -> list[Parameter]:
+    """Amplitudes and nonlinear constants of an effect with their units."""
+    form = FORMS[effect.form]
+    stds = stds or (float("nan"),) * (effect.n_columns + len(effect.constants))
+    found, column = [], 0
+    for term in effect.terms:
+        for basis in form.bases:
+            name = term.port
+            if term.driver != "one":
+                name += f" ~ {term.driver}"
+                if term.basis != "linear":
+                    name += f" {term.basis}"
+                if term.basis == "bump":
+                    name += f" at {term.constants[0]:.2f}"
+            if len(form.bases) > 1:
+                name += f", {basis}"
+            per = _PER_DRIVER.get(basis, 0) if effect.driver != "constant" else 0
+            unit = _per(_PORT[term.port].unit, driver_unit(effect.driver), per, basis == "rate")
+            found.append(Parameter(name, effect.amplitudes[column], stds[column], unit))
+            column += 1
+    for k, constant in enumerate(form.constants):
+        unit = constant.unit.replace("driver", driver_unit(effect.driver))
+        found.append(
+            Parameter(constant.name, effect.constants[k], stds[effect.n_columns + k], unit)
+        )
+    return found
+
+
+def _per(unit: str, driver: str, power: int, hourly: bool) -> str:
+    if power == 0:
+        return unit
+    driver = f"({driver})" if "/" in driver or " " in driver else driver
+    below = driver if power == 1 else f"{driver}²"
+    if hourly:
+        below = f"({driver}/h)"
+    return f"{unit}/{below}"
+
+
+_SCALES = {
+    "m": ((1.0, "m"), (1e-3, "mm"), (1e-6, "µm")),
+    "rad": ((1.0, "rad"), (1e-3, "mrad"), (1e-6, "µrad"), (1e-9, "nrad")),
+    "s": ((3600.0, "h"), (60.0, "min"), (1.0, "s"), (1e-3, "ms"), (1e-6, "µs")),
+    "1": ((1.0, ""), (1e-2, "%"), (1e-6, "ppm")),
+    "px": ((1.0, "px"), (1e-3, "mpx")),
+}
+
+
+def quantity(value: float, std: float, unit: str) -> str:
+    """A value with its standard deviation in a unit that reads well: "-1.04 ± 0.01 mm"."""
+    head, slash, below = unit.partition("/")
+    scale, prefixed = 1.0, head
+    for scale, prefixed in _SCALES.get(head, ((1.0, head),)):
+        if abs(value) >= scale * (0.02 if head == "px" else 1.0):
+            break
+    tail = f"{prefixed}{slash}{below}" if prefixed else (f"1/{below}" if slash else "")
+    if not math.isfinite(std) or std <= 0.0:
+        return f"{_significant(value / scale, 3)} {tail}".strip()
+    digits = max(0, 1 - math.floor(math.log10(std / scale)))
+    if digits > 6:
+        return f"{_significant(value / scale, 4)} {tail}".strip()
+    return f"{value / scale:.{digits}f} ± {std / scale:.{digits}f} {tail}".strip()
+
+
+def _significant(value: float, digits: int) -> str:
+    text = f"{value:.{digits}g}"
+    return f"{float(text):g}" if re.search(r"e[+-]?\d", text) and 1e-4 < abs(value) < 1e6 else text
+
+
+def when(effect: Effect) -> str:
+    """How an effect runs: "always", or with its driver and the constants of its form."""
+    form = FORMS[effect.form]
+    if effect.form == "constant":
+        return "always"
+    words = form.words.format(driver=effect.driver)
+    named = [
+        f"{constant.name} {quantity(value, 0.0, constant.unit.replace('driver', driver_unit(effect.driver)))}"
+        for constant, value in zip(form.constants, effect.constants, strict=True)
+    ]
+    return f"{words} ({', '.join(named)})" if named else words
+
+
+def size(finding: Finding, final: bool = False) -> str:
+    """All amplitudes of a finding in one phrase; a free-form curve by its range."""
+    effect = finding.final_effect if final else finding.effect
+    stds = finding.final_stds if final else finding.stds
+    numbers = parameters(effect, stds)[: effect.n_columns]
+    if len(numbers) > 4:
+        values = [p.value for p in numbers]
+        low, high = min(values), max(values)
+        unit = numbers[0].unit
+        return f"a curve between {quantity(low, 0.0, unit)} and {quantity(high, 0.0, unit)}"
+    return ", ".join(f"{p.name} {quantity(p.value, p.std, p.unit)}" for p in numbers)
+
+
+def in_pixels(finding: Finding) -> float:
+    """RMS (px) of what the finding explains on held-out epochs."""
+    gain = finding.gain
+    return math.sqrt(max(gain.before_px**2 - gain.after_px**2, 0.0))
+
+
+def mistaken_for(finding: Finding) -> str:
+    """What the effect is easily taken for, by the catalogue."""
+    entries = finding.hypothesis.entries
+    return entries[0].mistaken_for if entries else ""
+
+
+def separate_by(finding: Finding) -> str:
+    """The recording that would tell it from its doubles."""
+    entries = finding.hypothesis.entries
+    return entries[0].separate_by if entries else "another driver's range, another geometry"
+
+
+def explanation(finding: Finding) -> str:
+    """Two sentences for an engineer."""
+    entries = finding.hypothesis.entries
+    if entries:
+        return entries[0].explanation
+    return (
+        "No named effect explains this. The best port and driver are given with a free-form or "
+        "simple course; it is not in the catalogue, but it improves epochs that were never fitted."
+    )
+
+
+def verdict_sentence(diagnosis: Diagnosis) -> str:
+    """The verdict with its reason."""
+    tried = f"{diagnosis.n_hypotheses:,} hypotheses"
+    p = f"p = {diagnosis.left_p_value:.2g}"
+    if diagnosis.verdict == "consistent":
+        return f"The recording agrees with its model: none of {tried} is significant (family-wise {p})."
+    if diagnosis.verdict == "explained":
+        found = _count(len(diagnosis.findings))
+        return f"{found}; after that none of {tried} is significant (family-wise {p})."
+    left = f"Something significant is left ({p})"
+    if diagnosis.unproven:
+        left += (
+            f"; its best name, “{diagnosis.unproven}”, does not improve the held-out epochs and is "
+            "not claimed"
+        )
+    if diagnosis.verdict == "unexplained":
+        return f"The recording differs from its model, but nothing passes the proof. {left}."
+    return f"{_count(len(diagnosis.findings))}. {left}."
+
+
+def _count(n: int) -> str:
+    return (
+        "One effect was missing in the model"
+        if n == 1
+        else f"{n} effects were missing in the model"
+    )
+
+
+def summary(diagnosis: Diagnosis) -> str:
+    """The diagnosis for a terminal."""
+    plain, final = diagnosis.plain, diagnosis.final
+    lines = [
+        f"VERDICT  {diagnosis.verdict}",
+        f"         {verdict_sentence(diagnosis)}",
+        "",
+        f"held-out RMS   {plain.heldout_rms_px:.4f} px -> {final.heldout_rms_px:.4f} px"
+        f"   (noise about {diagnosis.noise_px:.4f} px)",
+        f"fitted RMS     {plain.rms_px:.4f} px -> {final.rms_px:.4f} px",
+        f"chi2 per dof   {plain.chi2_per_dof:.3f} -> {final.chi2_per_dof:.3f}",
+    ]
+    if diagnosis.n_rejected:
+        lines.append(f"set aside      {diagnosis.n_rejected} gross errors")
+    for number, finding in enumerate(diagnosis.findings, start=1):
+        effect, gain = finding.effect, finding.gain
+        named = "" if finding.hypothesis.entries else "   (not in the catalogue)"
+        lines += [
+            "",
+            f"{number}. {effect.name}{named}",
+            f"   where     {effect.scope.words()}",
+            f"   when      {when(effect)}",
+            f"   size      {size(finding)}",
+            f"   explains  {100 * finding.share:.0f} % of the excess chi-square, "
+            f"{in_pixels(finding):.3f} px RMS; p = {finding.p_value:.2g}, family-wise, "
+            f"of {finding.n_hypotheses:,} hypotheses",
+            f"   proof     held-out {gain.before_px:.4f} px -> {gain.after_px:.4f} px "
+            f"({100 * gain.interval[0]:.1f} to {100 * gain.interval[1]:.1f} % of chi-square, 95 %)",
+        ]
+        if finding.rivals:
+            alike = "; ".join(
+                f"{r.hypothesis.effect(()).name}, {r.hypothesis.scope.words()} ({r.weight:.2f})"
+                for r in finding.rivals
+            )
+            lines.append(f"   or        {alike}  [weight of the above {finding.weight:.2f}]")
+            lines.append(f"   separate  {separate_by(finding)}")
+    located = diagnosis.located_left if diagnosis.findings else diagnosis.located_before
+    if located and diagnosis.significant_left:
+        lines += ["", "left over  " + "; ".join(place.words() for place in located[:3])]
+    return "\n".join(lines)
