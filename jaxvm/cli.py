@@ -89,8 +89,8 @@ def _parser() -> argparse.ArgumentParser:
     convert = command("convert", _convert, "make a recording of other programs' files")
     convert.add_argument(
         "source",
-        help="table of corners (.csv), mrcal's corners (.vnl) or .cameramodel, OpenCV's calibration "
-        "(.yml, .xml), the folder of a recording, or the name of a public one",
+        help="table of corners (.csv), mrcal's corners (.vnl) or .cameramodel, OpenCV's "
+        "calibration (.yml, .xml), the folder of a recording, or the name of a public one",
     )
     convert.add_argument("--out", type=Path, required=True, metavar="RECORDING")
     convert.add_argument("--table", choices=("csv", "parquet"), default="csv")

@@ -15,6 +15,7 @@ from jaxvm.recording import read_recording
 from jaxvm.recording.files import write_files
 from jaxvm.report.words import quantity, size, when
 from jaxvm.simulate import HIDEABLE, Truth, simulate_deformation_scene
+from jaxvm.simulate.scene import Size
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ def hidden_keys(hide: str | None, seed: int = 0) -> tuple[str, ...]:
 def demo(
     seed: int = 1,
     hide: str | None = None,
-    size: str = "full",
+    size: Size = "full",
     out: str | Path = "jaxvm-demo",
     progress: Callable[[str], None] = lambda line: None,
 ) -> Demonstration:

@@ -28,6 +28,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxvm.discover.hypotheses import Family, Hypothesis, member
 from jaxvm.network.binding import in_scope, observation_driver_table, ranges_in_scope
+from jaxvm.network.factors import PixelFactor, RangeFactor
 from jaxvm.network.residual import port_jacobian, whitening
 from jaxvm.network.scene import Scene
 from jaxvm.physics.drivers import pattern
@@ -139,6 +140,7 @@ def _whitened(problem: Problem, x, hessian: Arrow):
     n_effect = len(problem.network.pixels) + (problem.network.ranges is not None)
     tables = list(zip(problem.network.factors(), problem.packets, residuals, strict=True))
     for factor, packets, r in tables[:n_effect]:
+        assert isinstance(factor, PixelFactor | RangeFactor)
         half = half_rows(factors, packets, problem.jacobian(factor, packets, flat), problem.sizes)
         tangent = port_jacobian(factor, problem.network, state) * whitening(factor)[:, :, None]
         result.append((half, r, tangent))
@@ -155,19 +157,21 @@ def arrange(adjustment: Adjustment) -> Arrangement:
     obs = scene.recording.observations
     tables = zip(problem.network.factors(), problem.packets, whitened, strict=False)
     for number, (factor, packets, (half, r, tangent)) in enumerate(tables):
+        assert isinstance(factor, PixelFactor | RangeFactor)
         n = factor.n_real
         starts.append(sum(len(k) for k in keys))
         columns = np.asarray(packets.columns)[np.asarray(packet_of_rows(packets, len(r)))[:n]]
         local = columns - problem.sizes[0]
         inside = (local >= 0) & (columns < problem.n)
         group = np.where(inside, local // max(problem.sizes[2], 1), -1).max(axis=1, initial=-1)
-        if number < len(scene.tables):
+        if isinstance(factor, PixelFactor):
             rows = scene.tables[number]
             entity = obs.camera[rows] * len(scene.model.targets) + obs.target[rows]
             table = observation_driver_table(scene, factor, rows)
             drivers.append(np.asarray(table)[:n])
         else:
             ranges = scene.recording.ranges
+            assert ranges is not None
             first = len(scene.model.cameras) * len(scene.model.targets)
             entity = first + ranges.rangefinder * len(scene.model.targets) + ranges.target
             blank = np.zeros((n, drivers[0].shape[1]))
@@ -271,13 +275,13 @@ def score_residuals(
         )
         null = np.maximum(null, np.asarray(largest))
 
-        scored = [
+        drop, z, amplitude, seen, sound = (
             _spread(np.asarray(values), used, family.valid.shape, fill)
             for values, fill in (
                 (drop, 0.0), (z, -np.inf), (amplitude, 0.0), (seen, 0.0), (sound, False),
             )
-        ]  # fmt: skip
-        results.append(Scores(family, *scored, variance))
+        )  # fmt: skip
+        results.append(Scores(family, drop, z, amplitude, seen, sound, variance))
     return Ranking(tuple(results), null)
 
 

@@ -179,7 +179,7 @@ def _given_state(recording, station_row, target_row) -> State:
         world_from_target=jnp.asarray(poses(model.targets, target_row)),
         point=jnp.asarray(np.concatenate([t.points for t in model.targets])),
         station_from_rangefinder=jnp.asarray(np.reshape(finders, (-1, 6)).astype(float)),
-        link=jnp.asarray(np.zeros((0, 6)) if not named else links.pose[named]),
+        link=jnp.asarray(np.zeros((0, 6)) if links is None or not named else links.pose[named]),
         amplitude=jnp.zeros(0),
         constant=jnp.ones(1),
         identity=jnp.zeros((1, 6)),

@@ -288,7 +288,7 @@ def _unwrap(table: np.ndarray, rows: np.ndarray) -> None:
 def _triangulated(scene: Scene) -> Scene:
     """Points without coordinates, from the rays that see them (linear least squares)."""
     points = np.array(scene.state.point)
-    unknown = ~np.isfinite(points).all(axis=1)
+    unknown = ~np.all(np.isfinite(points), axis=1)
     if not unknown.any():
         return scene
     obs, model, state = scene.recording.observations, scene.model, scene.state
@@ -300,11 +300,10 @@ def _triangulated(scene: Scene) -> Scene:
         own = np.flatnonzero((obs.camera == i) & unknown[row])
         if len(own) == 0:
             continue
-        rays = rays_of_pixels(
-            lens_family(camera.lens),
-            *(np.asarray(values[i]) for values in (state.focal, state.centre, state.distortion)),
-            obs.pixel[own],
+        focal, centre, distortion = (
+            np.asarray(values[i]) for values in (state.focal, state.centre, state.distortion)
         )
+        rays = rays_of_pixels(lens_family(camera.lens), focal, centre, distortion, obs.pixel[own])
         mounted = _matrix(np.asarray(state.station_from_camera[i]))
         station = names.index(camera.station)
         for ray, k in zip(rays, own, strict=True):

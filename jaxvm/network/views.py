@@ -75,6 +75,7 @@ def pose_of_view(points: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, floa
     ok, turn, shift = _solve_pnp(np.ascontiguousarray(points, float), rays[:, :2])
     if not ok:
         return None
+    assert turn is not None and shift is not None
     camera = cv2.Rodrigues(turn)[0] @ points.T + shift
     if (camera[2] <= 0).any():
         return None

@@ -7,6 +7,7 @@ period. Everything is written for one course; tables of effects `vmap` over it.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -50,7 +51,7 @@ def play(x: Course, half_width: Float[Array, ""]) -> Course:
 
 def rate(x: Course, t: Course) -> Course:
     """Rate of change of x (driver's unit per hour), by central differences."""
-    return jnp.gradient(x, t / 3600.0)
+    return cast(Array, jnp.gradient(x, t / 3600.0))
 
 
 def bump(x: Course, centre: Float[Array, ""], width: Float[Array, ""]) -> Course:

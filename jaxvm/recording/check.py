@@ -38,11 +38,12 @@ def _pixels(recording: Recording, table: Table) -> None:
     margin = 0.05 * size[obs.camera]
     inside = (obs.pixel > -margin) & (obs.pixel < size[obs.camera] + margin)
     table.check(
-        inside.all(axis=1),
+        np.all(inside, axis=1),
         lambda row: (
             f"({obs.pixel[row, 0]:.6g}, {obs.pixel[row, 1]:.6g}) px is outside the image "
             f'of camera "{model.cameras[obs.camera[row]].name}" '
-            f"({size[obs.camera[row], 0]:g} x {size[obs.camera[row], 1]:g} px); mend it or image_size"
+            f"({size[obs.camera[row], 0]:g} x {size[obs.camera[row], 1]:g} px); "
+            "mend it or image_size"
         ),
     )
 
@@ -84,7 +85,7 @@ def _unused(recording: Recording, table: Table) -> None:
 
 
 def _too_few(recording: Recording, table: Table) -> None:
-    """Poses that fewer than three marks must determine, cameras with fewer numbers than unknowns."""
+    """Poses that fewer than three marks determine, cameras with more unknowns than numbers."""
     obs, model = recording.observations, recording.model
     if recording.links is None and recording.ranges is None:
         for i, target in enumerate(model.targets):

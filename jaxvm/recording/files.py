@@ -3,7 +3,7 @@
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -30,7 +30,7 @@ def new_folder(folder: str | Path) -> Iterator[Path]:
         shutil.rmtree(staging, ignore_errors=True)
 
 
-def write_files(folder: str | Path, contents: dict[str, str | bytes]) -> list[Path]:
+def write_files(folder: str | Path, contents: Mapping[str, str | bytes]) -> list[Path]:
     """Write files into a folder; each is there complete or as it was before.
 
     All are written beside their places first, so that a full disk or an interruption leaves the

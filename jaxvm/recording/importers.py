@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import cv2
+import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
@@ -263,7 +264,8 @@ def import_cameramodel(file: str | Path) -> Recording:
     if len(sizes) == 1:
         frame, sizes = frame.assign(camera="camera"), {"camera": next(iter(sizes.values()))}
     spacing = float(inputs["calibration_object_spacing"])
-    return board_recording(frame, *corners.shape[1:3], spacing, sizes, lens, file.stem)
+    rows, columns = corners.shape[1:3]
+    return board_recording(frame, rows, columns, spacing, sizes, lens, file.stem)
 
 
 def import_opencv_calibration(
@@ -303,7 +305,8 @@ def import_opencv_calibration(
     if len(matrices) == 2:
         if "R" in nodes and "T" in nodes:
             turn = cv2.Rodrigues(nodes["R"])[0].ravel()
-            right_from_left = pose_from_vector(np.concatenate([turn, nodes["T"].ravel()]))
+            vector = jnp.asarray(np.concatenate([turn, nodes["T"].ravel()]))
+            right_from_left = pose_from_vector(vector)
             pose["right"] = np.asarray(vector_from_pose(right_from_left.inverse()))
         else:
             free = frozenset(("pose",))

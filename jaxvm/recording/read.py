@@ -156,7 +156,7 @@ def _point_rows(table: Table, model: Model, target: np.ndarray, plane: bool) -> 
         lambda row: (
             f'point "{names[row]}" is not on target '
             f'"{model.targets[target[row]].name}" {has(known[target[row]])}; '
-            f"{did_you_mean(names[row], known[target[row]])}"
+            f"{did_you_mean(str(names[row]), known[target[row]])}"
         ),
     )
     return point
@@ -300,7 +300,7 @@ def _links(table: Table | None, model: Model, ids: np.ndarray) -> Links | None:
         dated = np.array([text not in ("", "nan", "None") for text in texts])
         if dated.any():
             rows = np.flatnonzero(dated)
-            part = Table(table.file, table.frame[dated], table.line[dated], table.word)
+            part = Table(table.file, table.frame.loc[dated], table.line[dated], table.word)
             epoch[rows] = _epoch_rows(part, ids)
     return Links(
         tuple(table.texts("link")), nodes["from"], nodes["to"], pose,

@@ -31,7 +31,7 @@ class Table:
         return RecordingError(f"{self.file} {place}: {problem}")
 
     def check(self, good: Bool[np.ndarray, " n"], problem) -> None:
-        """Raise at the first row that is not good; `problem(row)` says what is wrong and the mend."""
+        """Raise at the first bad row; `problem(row)` says what is wrong, and the mend."""
         if not good.all():
             row = int(np.flatnonzero(~good)[0])
             more = int(np.sum(~good)) - 1
@@ -55,7 +55,7 @@ class Table:
     def numbers(self, column: str, meaning: str) -> Float[np.ndarray, " n"]:
         """A column of finite numbers."""
         raw = self.frame[column]
-        values = pd.to_numeric(raw, errors="coerce").to_numpy(float)
+        values = np.asarray(pd.to_numeric(raw, errors="coerce"), float)
         self.check(
             np.isfinite(values),
             lambda row: (
@@ -87,7 +87,7 @@ class Table:
             place >= 0,
             lambda row: (
                 f'{column} "{texts[row]}" is not in {where} {has(known)}; '
-                f"{did_you_mean(texts[row], known)}"
+                f"{did_you_mean(str(texts[row]), known)}"
             ),
         )
         return place
@@ -140,7 +140,7 @@ def read_table(folder: Path, name: str, required: bool) -> Table | None:
     # Short rows are filled with NaN by the parser even without a filter for NaN.
     frame = frame.fillna("")
     filled = (frame != "").any(axis=1).to_numpy()
-    return Table(csv.name, frame[filled].reset_index(drop=True), line[filled])
+    return Table(csv.name, frame.loc[filled].reset_index(drop=True), line[filled])
 
 
 def _shown(value) -> str:

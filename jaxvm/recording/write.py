@@ -85,7 +85,7 @@ def _links(recording: Recording) -> pd.DataFrame:
     links, model = recording.links, recording.model
     assert links is not None
     bodies = {"camera": model.cameras, "station": model.stations, "target": model.targets}
-    frame = {
+    frame: dict[str, list[str] | np.ndarray] = {
         "link": list(links.name),
         "from": [f"{kind}:{bodies[kind][i].name}" for kind, i in links.from_node],
         "to": [f"{kind}:{bodies[kind][i].name}" for kind, i in links.to_node],

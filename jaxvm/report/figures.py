@@ -1,6 +1,7 @@
-"""The pictures of a report: where it differed, what explains it, and how well it fits afterwards."""
+"""The pictures of a report: where it differed, what explains it, how well it fits afterwards."""
 
 import io
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -12,7 +13,7 @@ from jaxvm.discover.diagnose import Diagnosis, Finding
 from jaxvm.discover.locate import ResidualTable
 
 BEFORE, AFTER, INK = "#c2410c", "#0f766e", "#334155"
-_STYLE = {
+_STYLE: dict[Any, Any] = {
     "font.size": 9.0,
     "axes.titlesize": 10.0,
     "axes.spines.top": False,
@@ -69,6 +70,7 @@ def residual_field(diagnosis: Diagnosis, cameras: int = 2, bins: int = 20) -> Fi
         ]
         largest = max(float(np.quantile(np.hypot(*f[2:4]), 0.98)) for f in fields if f[0].size)
         arrow = width / bins / max(largest, 1e-9)
+        drawn = None
         for axis, (x, y, u, v), name in zip(row, fields, ("before", "after"), strict=True):
             drawn = axis.quiver(
                 x, y, u * arrow, v * arrow, np.hypot(u, v), angles="xy", scale_units="xy",
@@ -77,6 +79,7 @@ def residual_field(diagnosis: Diagnosis, cameras: int = 2, bins: int = 20) -> Fi
             axis.set(xlim=(0, width), ylim=(height, 0), aspect="equal", xlabel="u (px)")
             axis.set_title(f"camera {model.cameras[camera].name}: {name}")
         row[0].set_ylabel("v (px)")
+        assert drawn is not None
         figure.colorbar(drawn, ax=list(row), label="mean residual (px)", shrink=0.85)
     return figure
 
@@ -117,6 +120,7 @@ def residual_marks(diagnosis: Diagnosis, targets: int = 3) -> Figure:
             count = np.bincount(table.point[own], minlength=len(points))
             maps.append(np.sqrt(total / np.maximum(2.0 * count, 1.0)))
         top = float(np.quantile(maps[0], 0.99))
+        drawn = None
         for axis, values, name in zip(row, maps, ("before", "after"), strict=True):
             drawn = axis.scatter(
                 *points.T, c=values, s=60, marker="s", cmap="magma_r", vmin=0.0, vmax=top
@@ -126,6 +130,7 @@ def residual_marks(diagnosis: Diagnosis, targets: int = 3) -> Figure:
             axis.margins(0.12)
             axis.set_title(f"target {model.targets[target].name}: {name}")
         row[0].set_ylabel("y on the target (m)")
+        assert drawn is not None
         figure.colorbar(drawn, ax=list(row), label="RMS residual (px)", shrink=0.85)
     return figure
 
@@ -173,7 +178,9 @@ def histogram(diagnosis: Diagnosis) -> Figure:
         values = table.residual[table.used].ravel()
         outside = float(np.mean(np.abs(values) > reach))
         label = f"{name} ({100 * outside:.2g} % beyond)"
-        axis.hist(values, edges, density=True, histtype="step", color=colour, lw=1.3, label=label)
+        axis.hist(
+            values, edges.tolist(), density=True, histtype="step", color=colour, lw=1.3, label=label
+        )
     normal = np.exp(-0.5 * (edges / noise) ** 2) / (noise * np.sqrt(2.0 * np.pi))
     axis.plot(edges, normal, color=INK, ls=":", lw=1.0, label=f"normal, {noise:.3f} px")
     axis.set(xlabel="residual of a pixel coordinate (px)", ylabel="density (1/px)")
@@ -184,13 +191,13 @@ def histogram(diagnosis: Diagnosis) -> Figure:
 def ranking_figure(finding: Finding, count: int = 10) -> Figure:
     """The leading hypotheses by evidence when the finding was made."""
     leading = finding.ranking[:count]
-    figure, axes = _figure(9.0, 0.5 + 0.3 * len(leading))
+    figure, axes = _figure(9.0, 1.2 + 0.3 * len(leading))
     axis = axes[0, 0]
     words = [text for text, _ in leading]
     values = [value for _, value in leading]
     chosen = [AFTER if k == finding.chosen else "#94a3b8" for k in range(len(leading))]
     axis.barh(range(len(leading)), values, color=chosen, height=0.7)
-    axis.set_yticks(range(len(leading)), words)
+    axis.set_yticks(range(len(leading)), words, fontsize=7)
     axis.invert_yaxis()
     axis.set_xlabel("evidence foretold by one tangent (twice a log posterior weight)")
     return figure

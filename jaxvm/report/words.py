@@ -87,10 +87,9 @@ _SCALES = {
 def quantity(value: float, std: float, unit: str) -> str:
     """A value with its standard deviation in a unit that reads well: "-1.04 ± 0.01 mm"."""
     head, slash, below = unit.partition("/")
-    scale, prefixed = 1.0, head
-    for scale, prefixed in _SCALES.get(head, ((1.0, head),)):
-        if abs(value) >= scale * (0.02 if head == "px" else 1.0):
-            break
+    scales = _SCALES.get(head, ((1.0, head),))
+    least = 0.02 if head == "px" else 1.0
+    scale, prefixed = next((s for s in scales if abs(value) >= least * s[0]), scales[-1])
     tail = f"{prefixed}{slash}{below}" if prefixed else (f"1/{below}" if slash else "")
     if not math.isfinite(std) or std <= 0.0:
         return f"{_significant(value / scale, 3)} {tail}".strip()
@@ -111,8 +110,9 @@ def when(effect: Effect) -> str:
     if effect.form == "constant":
         return "always"
     words = form.words.format(driver=effect.driver)
+    unit = driver_unit(effect.driver)
     named = [
-        f"{constant.name} {quantity(value, 0.0, constant.unit.replace('driver', driver_unit(effect.driver)))}"
+        f"{constant.name} {quantity(value, 0.0, constant.unit.replace('driver', unit))}"
         for constant, value in zip(form.constants, effect.constants, strict=True)
     ]
     return f"{words} ({', '.join(named)})" if named else words
@@ -165,7 +165,10 @@ def verdict_sentence(diagnosis: Diagnosis) -> str:
     tried = f"{diagnosis.n_hypotheses:,} hypotheses"
     p = f"p = {diagnosis.left_p_value:.2g}"
     if diagnosis.verdict == "consistent":
-        return f"The recording agrees with its model: none of {tried} is significant (family-wise {p})."
+        return (
+            f"The recording agrees with its model: none of {tried} is significant "
+            f"(family-wise {p})."
+        )
     if diagnosis.verdict == "explained":
         found = _count(len(diagnosis.findings))
         return f"{found}; after that none of {tried} is significant (family-wise {p})."

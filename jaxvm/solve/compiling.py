@@ -5,10 +5,10 @@ import jax.monitoring
 _total = 0.0
 
 
-def _listen(event: str, duration: float, **_) -> None:
+def _listen(event: str, duration_secs: float, **_) -> None:
     global _total
     if event.endswith("compile_duration"):
-        _total += duration
+        _total += duration_secs
 
 
 jax.monitoring.register_event_duration_secs_listener(_listen)

@@ -134,21 +134,39 @@ class NormalEquationSolver(optx.AbstractLeastSquaresSolver):
         }  # fmt: skip
 
 
-def gauss_newton(rtol=1e-12, atol=1e-9, limit=100, damping=0.0) -> NormalEquationSolver:
+def gauss_newton(
+    rtol: float | Float[Array, ""] = 1e-12,
+    atol: float | Float[Array, ""] = 1e-9,
+    limit: int | Int[Array, ""] = 100,
+    damping: float | Float[Array, ""] = 0.0,
+) -> NormalEquationSolver:
     """Full Gauss-Newton steps: fastest near the solution, may diverge far from it."""
     del damping
     return NormalEquationSolver(
-        rtol, atol, limit, optx.max_norm, optx.NewtonDescent(linear_solver=ArrowCholesky()),
-        optx.LearningRate(1.0),
-    )  # fmt: skip
+        rtol=rtol,
+        atol=atol,
+        limit=limit,
+        norm=optx.max_norm,
+        descent=optx.NewtonDescent(linear_solver=ArrowCholesky()),
+        search=optx.LearningRate(1.0),
+    )
 
 
-def levenberg_marquardt(rtol=1e-12, atol=1e-9, limit=100, damping=1e-3) -> NormalEquationSolver:
+def levenberg_marquardt(
+    rtol: float | Float[Array, ""] = 1e-12,
+    atol: float | Float[Array, ""] = 1e-9,
+    limit: int | Int[Array, ""] = 100,
+    damping: float | Float[Array, ""] = 1e-3,
+) -> NormalEquationSolver:
     """Damped steps with a trust region: the default."""
     return NormalEquationSolver(
-        rtol, atol, limit, optx.max_norm, optx.DampedNewtonDescent(linear_solver=ArrowCholesky()),
-        Relaxing(damping=damping),
-    )  # fmt: skip
+        rtol=rtol,
+        atol=atol,
+        limit=limit,
+        norm=optx.max_norm,
+        descent=optx.DampedNewtonDescent(linear_solver=ArrowCholesky()),
+        search=Relaxing(damping=damping),
+    )
 
 
 METHODS = {"gauss-newton": gauss_newton, "levenberg-marquardt": levenberg_marquardt}

@@ -90,7 +90,9 @@ def snoop(
             worst = order[np.unique(frame[order], return_index=True)[1]]
             for k in worst[value[worst] > limit]:
                 weights[table][k] = 0.0
-                rejected.append(Rejected(int(rows[k]), float(value[k]), _where(scene, rows[k])))
+                rejected.append(
+                    Rejected(int(rows[k]), float(value[k]), _where(scene, int(rows[k])))
+                )
                 found = True
         if not found:
             break
