@@ -243,7 +243,7 @@ def diagnose(
 
     progress("final fit to all epochs")
     whole = tuple(sound)
-    final = _fit(current.scene, _Fits(held, sound, whole, None))
+    final = _with_best_instants(_fit(current.scene, _Fits(held, sound, whole, None)), whole)
     excess = 2.0 * plain.cost - current.variance_factor * plain.degrees_of_freedom
     findings = [replace(f, share=float(f.drop / max(excess, 1e-9))) for f in findings]
     findings = _with_final_values(final, findings, len(effects))
@@ -277,8 +277,9 @@ def diagnose(
 
 
 def _room(effects: tuple[Effect, ...]) -> tuple[int, int]:
+    """Room for the effects given and those to be found; the same for few of them."""
     columns, constants = capacity(effects)
-    return columns + _ROOM[0], max(constants, 1) - 1 + _ROOM[1]
+    return max(_ROOM[0], columns + 8), max(_ROOM[1], constants + 3)
 
 
 def _split(scene: Scene, held: np.ndarray, sound) -> _Fits:
@@ -372,6 +373,28 @@ def _prune(current: Adjustment, findings: list[Finding], split: _Fits, n: int):
             without = _fit(current.scene.with_effects(kept, room), split)
             return without, findings[:k] + findings[k + 1 :]
     return current, findings
+
+
+def _with_best_instants(final: Adjustment, weights) -> Adjustment:
+    """The final fit with every step at the instant that all epochs prefer.
+
+    The fitted epochs alone leave open on which side an epoch between two of them lies.
+    """
+    time = np.asarray(final.scene.network.channels.epoch_time)
+    between = 0.5 * (time[1:] + time[:-1]) - time[0]
+    for k, effect in enumerate(final.scene.effects):
+        if effect.form != "step":
+            continue
+        place = int(np.argmin(np.abs(between - effect.constants[0])))
+        for other in between[max(place - 1, 0) : place + 2]:
+            effects = list(final.scene.fitted_effects())
+            effects[k] = replace(effects[k], constants=(float(other),))
+            room = (final.scene.network.effects.n_columns, final.scene.state.constant.shape[0])
+            scene = final.scene.with_effects(tuple(effects), room)
+            tried = adjust(scene, weights=weights, rtol=1e-8, check=False)
+            if tried.cost < final.cost:
+                final = tried
+    return final
 
 
 def _fitted_residuals(adjustment: Adjustment, split: _Fits) -> np.ndarray:

@@ -68,7 +68,7 @@ def residual_field(diagnosis: Diagnosis, cameras: int = 2, bins: int = 20) -> Fi
             _binned(table, table.camera == camera, *edges)
             for table in (diagnosis.before, diagnosis.after)
         ]
-        largest = max(float(np.quantile(np.hypot(*f[2:4]), 0.98)) for f in fields if f[0].size)
+        largest = max(float(np.quantile(np.hypot(*f[2:4]), 0.9)) for f in fields if f[0].size)
         arrow = width / bins / max(largest, 1e-9)
         drawn = None
         for axis, (x, y, u, v), name in zip(row, fields, ("before", "after"), strict=True):
@@ -238,7 +238,8 @@ def _against_shift(before, after, shift) -> Figure:
                          / np.maximum(count, 1) / np.maximum(count - 1, 1))  # fmt: skip
         axis.errorbar(middle, mean, spread, fmt="o", ms=3.5, lw=1.0, color=colour,
                       label=f"{name} the effect")  # fmt: skip
-    axis.plot(edges[[0, -1]], edges[[0, -1]], color=INK, ls=":", lw=1.0, label="the effect")
+    reach = middle[[0, -1]]
+    axis.plot(reach, reach, color=INK, ls=":", lw=1.0, label="the effect")
     axis.set(xlabel="shift that the effect gives a point (px, signed)",
              ylabel="mean residual along it (px)")  # fmt: skip
     axis.legend()

@@ -1,0 +1,127 @@
+"""Commands: answers, JSON, bad input with status 2 and nothing half-done, interruption."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import pytest
+from networks import board_recording
+
+import jaxvm.cli
+from jaxvm.cli import main
+from jaxvm.recording import read_recording, write_recording
+from jaxvm.simulate import HIDEABLE
+
+
+@pytest.fixture
+def board(tmp_path, monkeypatch):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "compiled"))
+    monkeypatch.setattr(jaxvm.cli, "_keep_compiled", lambda: None)
+    return write_recording(board_recording().recording, tmp_path / "board")
+
+
+def test_validate(board, capsys):
+    assert main(["validate", str(board)]) == 0
+    assert "1 camera(s)" in capsys.readouterr().out
+    assert main(["validate", str(board), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["valid"] is True
+
+
+def test_adjust_and_its_model(board, tmp_path, capsys):
+    out = tmp_path / "adjusted"
+    assert main(["adjust", str(board), "--out", str(out), "--json", "--quiet"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["why"].startswith("converged") and 0.5 < told["variance_factor"] < 1.5
+    assert {f.name for f in out.iterdir()} == {"adjustment.json", "model.toml", "poses.csv"}
+    # The adjusted model is a model: adjusting with it changes nothing.
+    model = str(out / "model.toml")
+    assert main(["adjust", str(board), "--model", model, "--json", "--quiet"]) == 0
+    assert json.loads(capsys.readouterr().out)["cost"] == pytest.approx(told["cost"], rel=1e-9)
+
+
+@pytest.mark.parametrize("command", ["diagnose", "adjust", "validate"])
+def test_bad_recording(command, board, tmp_path, capsys):
+    table = board / "observations.csv"
+    lines = table.read_text().splitlines()
+    lines[11] = lines[11].replace("cam,", "came,")
+    table.write_text("\n".join(lines) + "\n")
+    before = sorted(tmp_path.iterdir())
+    out = [] if command == "validate" else ["--out", str(tmp_path / "out")]
+    assert main([command, str(board), *out, "--quiet"]) == 2
+    said = capsys.readouterr().err
+    assert 'observations.csv line 12: camera "came" is not in recording.toml' in said
+    assert said.count("\n") == 1
+    assert sorted(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["validate", "nowhere"], "there is no such folder"),
+        (["diagnose", "nowhere"], "there is no such folder"),
+        (["demo", "--hide", "gremlins"], 'no effect "gremlins" can be hidden'),
+        (["simulate", "deformation", "--hide", "x", "--out", "o"], 'no effect "x"'),
+        (["convert", "nothing.txt", "--out", "o"], "is no folder"),
+    ],
+)
+def test_bad_arguments(arguments, words, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(jaxvm.cli, "_keep_compiled", lambda: None)
+    assert main([*arguments, "--quiet"] if arguments[0] == "demo" else arguments) == 2
+    assert words in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_unknown_option_is_status_2(capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(["diagnose", "--colour"])
+    assert stopped.value.code == 2
+    assert "usage" in capsys.readouterr().err
+
+
+def test_singular_network_is_named(board, tmp_path, capsys):
+    """A camera of which one view of a plane is known: some of its numbers are free to choose."""
+    alone = read_recording(board)
+    first = alone.select_epochs(alone.epoch_ids == alone.epoch_ids[0])
+    free = frozenset({"focal", "centre"})
+    camera = replace(alone.model.cameras[0], lens="pinhole", distortion=None, free=free)
+    model = replace(alone.model, cameras=(camera,))
+    folder = write_recording(replace(first, model=model), tmp_path / "alone")
+    assert main(["adjust", str(folder), "--out", str(tmp_path / "out"), "--quiet"]) == 2
+    assert "camera cam" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_simulate_writes_a_valid_recording(tmp_path, capsys):
+    folder = tmp_path / "scene"
+    arguments = ["simulate", "deformation", "--hide", "mount-slip", "--size", "small"]
+    assert main([*arguments, "--out", str(folder), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["hidden"] == ["mount-slip"]
+    assert len(read_recording(folder).time) == 40
+    # Nothing in the folder tells what is hidden.
+    text = "".join(f.read_text() for f in folder.iterdir()).lower()
+    assert not [key for key in HIDEABLE if key in text] and "slip" not in text
+    assert main([*arguments, "--out", str(folder)]) == 2
+    assert "already there" in capsys.readouterr().err
+
+
+def test_interrupted_run_leaves_nothing(board, tmp_path):
+    out = tmp_path / "report"
+    run = subprocess.Popen(
+        [sys.executable, "-m", "jaxvm.cli", "diagnose", str(board), "--out", str(out)],
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "JAX_COMPILATION_CACHE_DIR": str(tmp_path / "compiled")},
+    )
+    assert run.stderr is not None
+    assert "start values" in run.stderr.readline()
+    time.sleep(0.5)
+    run.send_signal(signal.SIGINT)
+    _, said = run.communicate(timeout=120)
+    assert run.returncode == 130 and "interrupted" in said
+    assert not out.exists()
+    assert not [f for f in tmp_path.iterdir() if f.name.startswith(".")]
