@@ -47,7 +47,7 @@ def _parser() -> argparse.ArgumentParser:
         return own
 
     demo = command("demo", _demo, "hide physics in a simulated recording and find it")
-    demo.add_argument("--seed", type=_natural, default=1, help="draws scene, noise and effect")
+    demo.add_argument("--seed", type=_natural, default=10, help="draws scene, noise and effect")
     demo.add_argument(
         "--hide",
         default=None,

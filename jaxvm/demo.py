@@ -35,7 +35,7 @@ def hidden_keys(hide: str | None, seed: int = 0) -> tuple[str, ...]:
 
 
 def demo(
-    seed: int = 1,
+    seed: int = 10,
     hide: str | None = None,
     size: Size = "full",
     out: str | Path = "jaxvm-demo",

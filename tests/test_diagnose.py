@@ -76,10 +76,10 @@ def test_hidden_physics_is_found(key, tmp_path):
     assert gain.proven and gain.after_px < gain.before_px
     assert finding.p_value <= 0.01
     assert 0.9 < finding.share < 1.1
-    # All but single held-out epochs end at the simulator's noise of 0.05 px. (A step between two
-    # fitted epochs can put the one between them on the wrong side.)
+    # All but single held-out epochs end at the stated noise, the simulator's 0.05 px. (A step
+    # between two fitted epochs can put the one between them on the wrong side.)
     square, count = found.heldout_after.square, found.heldout_after.count
-    assert np.sqrt(np.median(square / count)) == pytest.approx(0.05, rel=0.05)
+    assert np.sqrt(np.median(square / count)) == pytest.approx(1.0, rel=0.05)
     if finding.effect.catalogue_id != expected.name:
         # A double that this recording can't tell from it: both are named, with their weights.
         assert finding.weight < 0.95, summary(found)

@@ -37,7 +37,7 @@ ALPHA = 0.01
 GROSS = 12.0
 """Residuals beyond this many robust standard deviations are mistakes, not physics."""
 
-_ROOM = (16, 4)
+_ROOM = (16, 8)
 _CANDIDATES = 4
 _NEAR = 30.0
 _TIE = 0.05
