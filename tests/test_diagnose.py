@@ -104,6 +104,21 @@ def test_hidden_physics_is_found(key, tmp_path):
         assert abs(value - true) < 4.0 * std + 0.05 * true, (value, std, true)
 
 
+def test_two_effects_at_once(tmp_path):
+    """Alone a principal point fits better; beside the growing plate the mount gets its name."""
+    truth, recording = recorded(("hysteresis", "plate-expansion"), tmp_path, seed=1)
+    found = diagnose(recording)
+    assert found.verdict == "explained", summary(found)
+    names = [finding.effect.catalogue_id for finding in found.findings]
+    assert names == ["mount-hysteresis", "target-expansion"], summary(found)
+    assert [f.effect.scope.as_dict() for f in found.findings] == [t.place for t in truth]
+    for finding, name, true in zip(found.findings, ("turn", "expansion"), truth, strict=True):
+        value, std = finding.effect.amplitudes[0], finding.stds[0]
+        assert abs(value - true_value(true, name)) < 4.0 * std
+    before = [f.gain.before_px for f in found.findings]
+    assert before == sorted(before, reverse=True) and found.final.heldout_rms_px < before[-1]
+
+
 def test_nothing_hidden_is_consistent(tmp_path):
     truth, recording = recorded((), tmp_path)
     assert truth == []

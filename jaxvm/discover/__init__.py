@@ -1,5 +1,6 @@
 """From mismatch to physics: score every hypothesis, name it, model it, prove it on held-out."""
 
-from jaxvm.discover.diagnose import Diagnosis, Finding, diagnose
+from jaxvm.discover.diagnose import diagnose
+from jaxvm.discover.diagnosis import Diagnosis, Finding
 
 __all__ = ["Diagnosis", "Finding", "diagnose"]

@@ -6,12 +6,12 @@ significant is left. No finding is claimed that does not pass on epochs which we
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from jaxvm.discover.diagnosis import Diagnosis, Finding, Quality
 from jaxvm.discover.heldout import (
-    Gain,
     HeldOut,
     evaluate,
     gain,
@@ -20,15 +20,17 @@ from jaxvm.discover.heldout import (
     weights_of,
 )
 from jaxvm.discover.hypotheses import Hypothesis, enumerate_hypotheses
-from jaxvm.discover.locate import Place, ResidualTable, locate, residual_table
-from jaxvm.discover.score import Ranking, score
-from jaxvm.discover.select import Candidate, Rival, identity, refit, rivals, shortlist
+from jaxvm.discover.locate import ResidualTable, locate, residual_table
+from jaxvm.discover.revise import prune, rename
+from jaxvm.discover.score import score
+from jaxvm.discover.select import Candidate, identity, refit, rivals, shortlist
+from jaxvm.discover.visible import smallest_visible
 from jaxvm.network.scene import Scene, build
 from jaxvm.network.start import start
 from jaxvm.physics.effects import Effect, capacity
 from jaxvm.recording import Recording
 from jaxvm.solve.adjust import Adjustment, adjust, reference_sigma
-from jaxvm.solve.covariance import standard_deviations, wald_drops
+from jaxvm.solve.covariance import standard_deviations
 from jaxvm.solve.snooping import robust_variance
 
 ALPHA = 0.01
@@ -41,103 +43,8 @@ _ROOM = (16, 8)
 _CANDIDATES = 4
 _NEAR = 30.0
 _TIE = 0.05
+_OPEN = 100.0, 0.02
 _FLIPS = 299
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One proven effect.
-
-    Attributes:
-        hypothesis: what it is.
-        effect: with amplitudes and constants as they were found, in the fitted epochs.
-        stds: standard deviations of the amplitudes, then of the constants.
-        final_effect, final_stds: the same from all epochs, together with all later findings.
-        weight: posterior weight among its doubles.
-        rivals: hypotheses that this recording can't tell from it.
-        p_value: family-wise.
-        n_hypotheses: how many were tried.
-        drop: of chi-square in the fitted epochs, by the stated sigmas.
-        share: of the plain model's excess chi-square that it explains.
-        before, after: whitened pixel residuals of the fitted epochs without and with it, rows in
-            the order of the recording's observations; NaN where not fitted.
-        gain: on held-out epochs.
-        ranking: leading hypotheses at the time, as (words, evidence).
-        chosen: place of this one among them.
-    """
-
-    hypothesis: Hypothesis
-    effect: Effect
-    stds: tuple[float, ...]
-    final_effect: Effect
-    final_stds: tuple[float, ...]
-    weight: float
-    rivals: tuple[Rival, ...]
-    p_value: float
-    n_hypotheses: int
-    drop: float
-    share: float
-    before: np.ndarray
-    after: np.ndarray
-    gain: Gain
-    ranking: tuple[tuple[str, float], ...]
-    chosen: int
-
-
-@dataclass(frozen=True)
-class Quality:
-    """How well a model fits: weighted RMS (px) fitted and held out, chi-square per freedom."""
-
-    rms_px: float
-    heldout_rms_px: float
-    chi2_per_dof: float
-
-
-@dataclass(frozen=True)
-class Diagnosis:
-    """Everything that a report says.
-
-    Attributes:
-        recording: what was diagnosed.
-        verdict: "consistent", "explained", "partly explained" or "unexplained".
-        noise_px: robust standard deviation of one pixel coordinate after the last fit.
-        plain, final: quality of the first and the last model.
-        findings: in the order in which they were found.
-        significant_left: whether something significant is left over.
-        left_p_value: its family-wise p-value.
-        located_before, located_left: where residuals are large, before and after.
-        before, after: residual tables of the plain and the last model (all epochs).
-        held: epochs that were set aside.
-        heldout_before, heldout_after: squares by held-out epoch.
-        scene: the last model, fitted to all epochs.
-        n_rejected: gross errors set aside.
-        n_hypotheses: hypotheses in the last round.
-        unproven: the leading name for what is left, where it did not pass on held-out epochs.
-        smallest: smallest amplitude that the recording could show, by catalogue entry.
-        seconds: wall time.
-    """
-
-    recording: Recording
-    verdict: str
-    noise_px: float
-    plain: Quality
-    final: Quality
-    findings: tuple[Finding, ...]
-    significant_left: bool
-    left_p_value: float
-    located_before: tuple[Place, ...]
-    located_left: tuple[Place, ...]
-    before: ResidualTable
-    after: ResidualTable
-    held: np.ndarray
-    heldout_before: HeldOut
-    heldout_after: HeldOut
-    scene: Scene
-    n_rejected: int
-    n_hypotheses: int
-    unproven: str
-    smallest: dict[str, tuple[float, str]] = field(default_factory=dict)
-    seconds: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -194,9 +101,11 @@ def diagnose(
     plain = base
     n = sum(int(w.sum()) * 2 for w in split.weights)
 
+    def fit(scene: Scene) -> Adjustment:
+        return _fit(scene, split)
+
     current, best_heldout = base, plain_heldout
     findings: list[Finding] = []
-    candidates: list[Candidate] = []
     hopeless: set = set()
     unproven, p_value, ranking = "", 1.0, None
     while True:
@@ -213,7 +122,7 @@ def diagnose(
         if isinstance(accepted, str):
             unproven = accepted
             break
-        chosen, heldout, proof = accepted
+        chosen, doubles_too, heldout, proof = accepted
         weight, doubles = rivals(current.scene, arrangement, ranking, chosen, current, n)
         drop = 2.0 * (current.cost - chosen.adjustment.cost)
         findings.append(
@@ -233,13 +142,25 @@ def diagnose(
                 after=_fitted_residuals(chosen.adjustment, split),
                 gain=proof,
                 ranking=tuple((_short(h), e) for h, e, _ in leading),
+                doubles=doubles_too,
                 chosen=next(k for k, (h, _, _) in enumerate(leading) if h is chosen.hypothesis),
             )
         )
-        candidates.append(chosen)
         progress(f"found: {chosen.effect.name} ({chosen.effect.scope.words()})")
         current, best_heldout = replace(chosen.adjustment, scene=heldout.scene), heldout
-        current, findings = _prune(current, findings, split, n)
+        kept = len(findings)
+        current, findings = prune(current, findings, n, fit)
+        if len(findings) < kept:
+            current, best_heldout = _proven(current, held, sound)
+
+    names = [finding.hypothesis for finding in findings]
+    current, findings = rename(current, findings, n, fit)
+    if [finding.hypothesis for finding in findings] != names:
+        current, best_heldout = _proven(current, held, sound)
+        deviations = _deviations(current)[len(effects) :]
+        findings = [
+            replace(f, stds=f.stds or own) for f, own in zip(findings, deviations, strict=True)
+        ]
 
     progress("final fit to all epochs")
     whole = tuple(sound)
@@ -271,9 +192,15 @@ def diagnose(
         n_rejected=n_rejected,
         n_hypotheses=ranking.n,
         unproven=unproven,
-        smallest=_smallest(ranking, robust_variance(current), current.scene),
+        smallest=smallest_visible(ranking, robust_variance(current), current.scene),
         seconds=time.perf_counter() - began,
     )
+
+
+def _proven(current: Adjustment, held, sound) -> tuple[Adjustment, HeldOut]:
+    """The fit with its held-out epochs evaluated and their poses taken over."""
+    heldout = evaluate(current.scene, held, sound)
+    return replace(current, scene=heldout.scene), heldout
 
 
 def _room(effects: tuple[Effect, ...]) -> tuple[int, int]:
@@ -344,7 +271,13 @@ def _accept(
             tried = evaluate(candidate.adjustment.scene, held, sound)
             proof = gain(heldout, tried, seed)
             if proof.proven:
-                return candidate, tried, proof
+                gap = max(_OPEN[0], _OPEN[1] * abs(candidate.evidence))
+                others = tuple(
+                    c.hypothesis
+                    for c in refitted
+                    if c is not candidate and candidate.evidence - c.evidence < gap
+                )
+                return candidate, others, tried, proof
             hopeless.add((identity(candidate.hypothesis), candidate.hypothesis.course))
     return _short(leading[0][0])
 
@@ -355,24 +288,6 @@ def _common_evidence(candidate: Candidate, all_candidates, current: Adjustment, 
     own = candidate.adjustment.variance_factor
     drop = 2.0 * (current.cost - candidate.adjustment.cost)
     return candidate.evidence + drop * (1.0 / variance - 1.0 / own)
-
-
-def _prune(current: Adjustment, findings: list[Finding], split: _Fits, n: int):
-    """Drop an earlier finding that the later ones made superfluous (Wald test against BIC)."""
-    given = len(current.scene.effects) - len(findings)
-    ends = np.cumsum([effect.n_columns for effect in current.scene.effects])
-    groups = [np.arange(end - e.n_columns, end)
-              for e, end in zip(current.scene.effects, ends, strict=True)]  # fmt: skip
-    drops = wald_drops(current, groups[given:])
-    for k, (finding, drop) in enumerate(zip(findings[:-1], drops, strict=False)):
-        columns = len(finding.effect.amplitudes) + len(finding.effect.constants)
-        if drop / current.variance_factor < columns * np.log(n):
-            effects = current.scene.fitted_effects()
-            kept = (*effects[: given + k], *effects[given + k + 1 :])
-            room = (current.scene.network.effects.n_columns, current.scene.state.constant.shape[0])
-            without = _fit(current.scene.with_effects(kept, room), split)
-            return without, findings[:k] + findings[k + 1 :]
-    return current, findings
 
 
 def _with_best_instants(final: Adjustment, weights) -> Adjustment:
@@ -464,44 +379,3 @@ def _short(hypothesis: Hypothesis) -> str:
         parts.append(f"{effect.form} in {effect.driver}")
     parts.append(effect.scope.words())
     return " · ".join(parts)
-
-
-def _smallest(ranking: Ranking, variance: float, scene: Scene) -> dict[str, tuple[float, str]]:
-    """Smallest amplitude that would be found at family-wise 5 % with power 80 %, by entry.
-
-    sqrt(lambda0 / I) with I the information of one column (MATHEMATICS 1.8); lambda0 from the
-    number of hypotheses. Single-term constant hypotheses only; the most favourable place counts.
-    """
-    from scipy.stats import norm
-
-    from jaxvm.discover.hypotheses import member
-    from jaxvm.physics.ports import PORTS
-
-    level = norm.isf(0.025 / max(ranking.n, 1)) + norm.isf(0.2)
-    unit = {port.name: port.unit for port in PORTS}
-    smallest: dict[str, tuple[float, str]] = {}
-    for scores in ranking.scores:
-        if scores.amplitude.shape[-1] != 1:
-            continue
-        with np.errstate(divide="ignore", invalid="ignore"):
-            # One-step amplitude a = S / I and drop S^2 / I give the information drop / a^2.
-            information = scores.drop / scores.amplitude[..., 0] ** 2
-            detectable = level * np.sqrt(variance / information)
-        detectable = np.where(scores.valid & np.isfinite(detectable), detectable, np.inf)
-        for g in range(len(scores.family.groups)):
-            for c, course in enumerate(scores.family.courses):
-                s = int(np.argmin(detectable[g, c]))
-                if not np.isfinite(detectable[g, c, s]) or course.form not in (
-                    "constant",
-                    "linear",
-                ):
-                    continue
-                hypothesis = member(scores.family, (g, c, s), scene)
-                for entry in hypothesis.entries:
-                    key = (
-                        f"{entry.id} ({course.driver})" if course.driver != "constant" else entry.id
-                    )
-                    value = float(detectable[g, c, s])
-                    if key not in smallest or value < smallest[key][0]:
-                        smallest[key] = (value, unit[hypothesis.group.terms[0].port])
-    return smallest

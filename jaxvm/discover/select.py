@@ -9,8 +9,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from jaxvm.discover.cells import Arrangement
 from jaxvm.discover.hypotheses import Hypothesis
-from jaxvm.discover.score import Arrangement, Ranking, score_residuals, top
+from jaxvm.discover.score import Ranking, score_residuals, top
 from jaxvm.network.scene import Scene
 from jaxvm.physics.effects import Effect
 from jaxvm.physics.forms import FORMS

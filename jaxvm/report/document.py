@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxvm.discover.diagnose import Diagnosis, Finding
+from jaxvm.discover.diagnosis import Diagnosis, Finding
 from jaxvm.discover.select import Rival
 from jaxvm.report.words import Parameter, explanation, parameters, separate_by, when
 

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from jaxvm.discover.diagnose import Diagnosis, Finding
+from jaxvm.discover.diagnosis import Diagnosis, Finding
 from jaxvm.discover.locate import ResidualTable
 
 BEFORE, AFTER, INK = "#c2410c", "#0f766e", "#334155"

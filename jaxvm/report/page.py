@@ -7,7 +7,7 @@ from pathlib import Path
 from jinja2 import Environment, PackageLoader, select_autoescape
 
 from jaxvm import __version__
-from jaxvm.discover.diagnose import Diagnosis
+from jaxvm.discover.diagnosis import Diagnosis
 from jaxvm.network.estimate import estimated_model
 from jaxvm.recording.files import write_files
 from jaxvm.recording.write import model_text

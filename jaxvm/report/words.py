@@ -4,7 +4,7 @@ import math
 import re
 from dataclasses import dataclass
 
-from jaxvm.discover.diagnose import Diagnosis, Finding
+from jaxvm.discover.diagnosis import Diagnosis, Finding
 from jaxvm.physics.effects import Effect
 from jaxvm.physics.forms import FORMS
 from jaxvm.physics.ports import PORTS

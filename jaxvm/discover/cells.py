@@ -1,0 +1,146 @@
+"""Residuals and tangents of a fitted scene, arranged in cells for scoring.
+
+Observations of one epoch, camera, target and local group form a *cell*; inside a cell the course of
+any effect and its scope are constant.
+"""
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxvm.network.binding import observation_driver_table
+from jaxvm.network.factors import PixelFactor, RangeFactor
+from jaxvm.network.residual import port_jacobian, whitening
+from jaxvm.solve.adjust import Adjustment
+from jaxvm.solve.arrow import Arrow, factorise
+from jaxvm.solve.problem import Problem, normal_at
+from jaxvm.solve.reduced import half_rows, packet_of_rows
+
+
+class Cells(eqx.Module):
+    """Residuals and tangents of a fitted scene, arranged in cells.
+
+    Attributes:
+        tangent: derivative of the whitened residuals with respect to each port.
+        residual: whitened residuals.
+        half: rows of J L^-T, the local part first.
+        group: cells of each local group, padded with the number of cells.
+        group_of: local group of each cell; the number of groups where it has none.
+        epoch: cells of each epoch, padded with the number of cells.
+    """
+
+    tangent: Float[Array, "ports cells rows"]
+    residual: Float[Array, "cells rows"]
+    half: Float[Array, "cells rows halves"]
+    group: Int[Array, "groups width"]
+    group_of: Int[Array, " cells"]
+    epoch: Int[Array, "epochs wide"]
+    n_local: int = eqx.field(static=True)
+
+    def by(self, index: Int[Array, "a b"], values: Float[Array, "... cells"]):
+        """Values of cells gathered by group or epoch; padding reads zero."""
+        zero = jnp.zeros((*values.shape[:-1], 1))
+        return jnp.concatenate([values, zero], axis=-1)[..., index]
+
+
+@dataclass(frozen=True)
+class Arrangement:
+    """Cells, and where the observations behind them are."""
+
+    cells: Cells
+    rows: np.ndarray  # [cells, width] into all observations, padded with their number
+    epoch: np.ndarray  # of each cell
+    drivers: np.ndarray  # observation-like drivers of all observations
+    starts: tuple[int, ...]  # first observation of each table (pixel tables, then ranges)
+    components: int
+
+
+@eqx.filter_jit
+def _whitened(problem: Problem, x, hessian: Arrow):
+    """Half rows, residuals and port tangents of all tables on which effects act."""
+    factors = factorise(hessian)
+    flat = problem.flat(x)
+    state = problem.network.layout.restore(flat)
+    residuals = jax.tree.leaves(problem.residual(x))
+    result = []
+    n_effect = len(problem.network.pixels) + (problem.network.ranges is not None)
+    tables = list(zip(problem.network.factors(), problem.packets, residuals, strict=True))
+    for factor, packets, r in tables[:n_effect]:
+        assert isinstance(factor, PixelFactor | RangeFactor)
+        half = half_rows(factors, packets, problem.jacobian(factor, packets, flat), problem.sizes)
+        tangent = port_jacobian(factor, problem.network, state) * whitening(factor)[:, :, None]
+        result.append((half, r, tangent))
+    return result
+
+
+def arrange(adjustment: Adjustment) -> Arrangement:
+    """Arrange residuals and tangents of an adjusted scene in cells."""
+    scene, problem = adjustment.scene, adjustment.problem
+    whitened = _whitened(problem, adjustment.x, normal_at(problem, adjustment.x).hessian)
+    n_groups = problem.sizes[1]
+    keys, drivers, halves, residuals, tangents, starts = [], [], [], [], [], []
+    components = max(r.shape[1] for _, r, _ in whitened)
+    obs = scene.recording.observations
+    tables = zip(problem.network.factors(), problem.packets, whitened, strict=False)
+    for number, (factor, packets, (half, r, tangent)) in enumerate(tables):
+        assert isinstance(factor, PixelFactor | RangeFactor)
+        n = factor.n_real
+        starts.append(sum(len(k) for k in keys))
+        columns = np.asarray(packets.columns)[np.asarray(packet_of_rows(packets, len(r)))[:n]]
+        local = columns - problem.sizes[0]
+        inside = (local >= 0) & (columns < problem.n)
+        group = np.where(inside, local // max(problem.sizes[2], 1), -1).max(axis=1, initial=-1)
+        if isinstance(factor, PixelFactor):
+            rows = scene.tables[number]
+            entity = obs.camera[rows] * len(scene.model.targets) + obs.target[rows]
+            table = observation_driver_table(scene, factor, rows)
+            drivers.append(np.asarray(table)[:n])
+        else:
+            ranges = scene.recording.ranges
+            assert ranges is not None
+            first = len(scene.model.cameras) * len(scene.model.targets)
+            entity = first + ranges.rangefinder * len(scene.model.targets) + ranges.target
+            blank = np.zeros((n, drivers[0].shape[1]))
+            blank[:, 0] = 1.0
+            drivers.append(blank)
+        keys.append(np.stack([group, np.asarray(factor.epoch)[:n], entity], axis=1))
+        pad = [(0, 0), (0, components - r.shape[1])]
+        halves.append(np.pad(np.asarray(half)[:n], [*pad, (0, 0)]))
+        residuals.append(np.pad(np.asarray(r)[:n], pad))
+        tangents.append(np.pad(np.asarray(tangent)[:n], [*pad, (0, 0)]))
+    key = np.concatenate(keys)
+    distinct, cell = np.unique(key, axis=0, return_inverse=True)
+    rows = _padded_lists(cell.ravel(), len(distinct), len(key))
+
+    def in_cells(parts):
+        values = np.concatenate(parts)
+        values = np.concatenate([values, np.zeros((1, *values.shape[1:]))])[rows]
+        return values.reshape(len(distinct), rows.shape[1] * components, *values.shape[3:])
+
+    cells = Cells(
+        tangent=jnp.asarray(np.moveaxis(in_cells(tangents), 2, 0)),
+        residual=jnp.asarray(in_cells(residuals)),
+        half=jnp.asarray(in_cells(halves)),
+        group=jnp.asarray(_padded_lists(distinct[:, 0], n_groups, len(distinct))),
+        group_of=jnp.asarray(np.where(distinct[:, 0] < 0, n_groups, distinct[:, 0])),
+        epoch=jnp.asarray(_padded_lists(distinct[:, 1], len(scene.recording.time), len(distinct))),
+        n_local=problem.sizes[2],
+    )
+    return Arrangement(
+        cells, rows, distinct[:, 1], np.concatenate(drivers), tuple(starts), components
+    )
+
+
+def _padded_lists(label: np.ndarray, n_labels: int, filler: int) -> np.ndarray:
+    """Positions of each label 0..n-1 as rows of equal length, filled up with `filler`."""
+    kept = np.flatnonzero(label >= 0)
+    counts = np.bincount(label[kept], minlength=n_labels)
+    lists = np.full((n_labels, max(int(counts.max(initial=0)), 1)), filler)
+    order = kept[np.argsort(label[kept], kind="stable")]
+    first = np.concatenate([[0], np.cumsum(counts)])[:-1]
+    lists[label[order], np.arange(len(order)) - first[label[order]]] = order
+    return lists
