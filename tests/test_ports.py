@@ -621,7 +621,8 @@ def test_sign_and_unit_by_hand(name):
         assert abs(case.value) <= port.largest
         sight, at = _bench_arrays(case.bench)
         values = np.zeros(N_PORTS)
-        plain = bench_pixel(sight, at, values)
+        # Read before `values` changes: a program may still be looking at this memory.
+        plain = np.asarray(bench_pixel(sight, at, values))
         values[PORT_INDEX[name]] = case.value
         if port.stage == "range":
             got = bench_range(sight, at, values, 0.0)

@@ -154,7 +154,9 @@ def diagnose(
             current, best_heldout = _proven(current, held, sound)
 
     names = [finding.hypothesis for finding in findings]
-    current, findings = rename(current, findings, n, fit)
+    if p_value > alpha:
+        # While something is left, names can't be decided any better than when they were found.
+        current, findings = rename(current, findings, n, fit)
     if [finding.hypothesis for finding in findings] != names:
         current, best_heldout = _proven(current, held, sound)
         deviations = _deviations(current)[len(effects) :]

@@ -23,7 +23,7 @@ DECIDED = 2.0 * np.log(20.0)
 CLEAR = 15.0
 """Difference of foretold evidence between two courses of the same terms that a refit won't turn."""
 
-_RTOL, _MAX_STEPS = 1e-6, 20
+_RTOL, _MAX_STEPS = 1e-6, 14
 
 UNNAMED_PRIOR = 0.01
 """Weight of a hypothesis that no engineer has a name for, against one of the catalogue."""

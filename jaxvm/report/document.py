@@ -58,6 +58,7 @@ def _finding(finding: Finding) -> dict[str, Any]:
         "n_hypotheses": finding.n_hypotheses,
         "weight": finding.weight,
         "equivalents": [_rival(rival) for rival in finding.rivals],
+        "nearly_as_good": [h.effect(()).name for h in finding.doubles],
         "separate_by": separate_by(finding),
         "explanation": explanation(finding),
         "heldout_rms_px": {"before": gain.before_px, "after": gain.after_px},

@@ -137,6 +137,13 @@ def in_pixels(finding: Finding) -> float:
     return math.sqrt(max(gain.before_px**2 - gain.after_px**2, 0.0))
 
 
+def nearly_as_good(finding: Finding) -> str:
+    """Hypotheses that were refitted too and fell behind only a little, by name."""
+    names = dict.fromkeys(h.effect(()).name for h in finding.doubles)
+    names.pop(finding.effect.name, None)
+    return "; ".join(names)
+
+
 def mistaken_for(finding: Finding) -> str:
     """What the effect is easily taken for, by the catalogue."""
     entries = finding.hypothesis.entries
@@ -227,6 +234,8 @@ def summary(diagnosis: Diagnosis) -> str:
             )
             lines.append(f"   or        {alike}  [weight of the above {finding.weight:.2f}]")
             lines.append(f"   separate  {separate_by(finding)}")
+        if nearly_as_good(finding):
+            lines.append(f"   nearly    {nearly_as_good(finding)}  [fitted a little worse]")
     located = diagnosis.located_left if diagnosis.findings else diagnosis.located_before
     if located and diagnosis.significant_left:
         lines += ["", "left over  " + "; ".join(place.words() for place in located[:3])]
