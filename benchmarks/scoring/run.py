@@ -9,6 +9,7 @@ import json
 import os
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,12 +31,15 @@ def main() -> None:
     recording = read_recording(simulate_deformation_scene((), seed=5).write(folder))
     fitted = adjust(start(build(recording)).with_effects((), (16, 8)))
     families = enumerate_hypotheses(fitted.scene)
+    # Every sixth course: about the 5,000 hypotheses that the target speaks of.
+    few = tuple(replace(f, courses=f.courses[::6], valid=f.valid[:, ::6]) for f in families)
+    few = tuple(family for family in few if family.valid.any())
     rows = []
-    for flips in (0, 299):
+    for asked, flips in ((few, 299), (families, 0), (families, 299)):
         seconds = []
         for _ in range(4):
             began = time.perf_counter()
-            ranking, _ = score(fitted, families, 1.0, max(flips, 1))
+            ranking, _ = score(fitted, asked, 1.0, max(flips, 1))
             seconds.append(time.perf_counter() - began)
         rows.append(
             {
@@ -54,11 +58,11 @@ def main() -> None:
     (HERE / "results.json").write_text(json.dumps(results, indent=1) + "\n")
     figure = Figure(figsize=(6, 3), layout="constrained")
     axis = figure.subplots()
-    labels = [f"{row['flips']} sign-flips" for row in rows]
+    labels = [f"{row['hypotheses']:,} hypotheses\n{row['flips']} sign-flips" for row in rows]
     axis.bar(labels, [np.median(row["run_s"]) for row in rows])
     axis.set(
         ylabel="seconds",
-        title=f"{rows[0]['hypotheses']:,} hypotheses, {results['residuals']:,} residuals",
+        title=f"{results['residuals']:,} residuals",
     )
     figure.savefig(HERE / "results.png", dpi=120)
     print(json.dumps(results, indent=1))
