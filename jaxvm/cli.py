@@ -21,7 +21,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         answer, text = options.run(options)
     except KeyboardInterrupt:
-        print("interrupted; no output was begun", file=sys.stderr)
+        print("interrupted; nothing was left half-written", file=sys.stderr)
         return INTERRUPTED
     except (ValueError, OSError) as problem:
         # Every foreseen complaint is a ValueError or OSError whose message names the mend.

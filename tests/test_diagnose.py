@@ -4,7 +4,7 @@ A diagnosis sees the folder of the recording and nothing else; the truth is look
 """
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -102,6 +102,25 @@ def test_hidden_physics_is_found(key, tmp_path):
         value, std = finding.effect.constants[0], finding.stds[finding.effect.n_columns]
         true = true_value(truth, expected.constant)
         assert abs(value - true) < 4.0 * std + 0.05 * true, (value, std, true)
+
+
+def test_a_mistake_is_no_physics_and_physics_no_mistake(tmp_path):
+    """One point measured 40 sigma off is set aside; a mark that is 40 sigma off always is found."""
+    _, recording = recorded((), tmp_path)
+    obs = recording.observations
+    wrong = 1234
+    pixel = obs.pixel.copy()
+    pixel[wrong, 0] += 2.0
+    found = diagnose(replace(recording, observations=replace(obs, pixel=pixel)))
+    assert found.n_rejected == 1 and found.verdict == "consistent", summary(found)
+    same = (obs.target == obs.target[wrong]) & (obs.point == obs.point[wrong])
+    pixel = obs.pixel.copy()
+    pixel[same & (obs.camera == 0)] += [2.0, 0.0]
+    found = diagnose(replace(recording, observations=replace(obs, pixel=pixel)))
+    assert found.n_rejected == 0 and found.findings, summary(found)
+    target = recording.model.targets[obs.target[wrong]]
+    where = found.findings[0].effect.scope.as_dict()
+    assert where == {"target": [target.name], "point": [target.point_names[obs.point[wrong]]]}
 
 
 def test_two_effects_at_once(tmp_path):

@@ -220,7 +220,10 @@ def _fit(scene: Scene, split: _Fits, check: bool = False) -> Adjustment:
 
 
 def _sound(base: Adjustment, scene: Scene, held, everything) -> tuple[np.ndarray, ...]:
-    """Observations without gross errors, by the plain model, in fitted and held-out epochs."""
+    """Observations without gross errors, by the plain model, in fitted and held-out epochs.
+
+    What goes on, in most epochs of a mark or over most of an image, is physics and stays.
+    """
     limit = GROSS * np.sqrt(robust_variance(base))
     inside = base.residuals()
     momentary = adjust(
@@ -230,13 +233,19 @@ def _sound(base: Adjustment, scene: Scene, held, everything) -> tuple[np.ndarray
         active=scene.unknowns.of_one_epoch,
         check=False,
     ).residuals()
-    return tuple(
-        (
-            (np.abs(np.asarray(a)).max(axis=1) <= limit)
-            & (np.abs(np.asarray(b)).max(axis=1) <= limit)
-        ).astype(float)
-        for a, b in zip(inside.pixels, momentary.pixels, strict=True)
-    )
+    obs = scene.recording.observations
+    n_marks = scene.first_point[-1]
+    mark = obs.camera * n_marks + scene.first_point[obs.target] + obs.point
+    image = obs.camera * len(held) + obs.epoch
+    sound = []
+    for rows, a, b in zip(scene.tables, inside.pixels, momentary.pixels, strict=True):
+        beyond = np.maximum(np.abs(np.asarray(a)), np.abs(np.asarray(b))).max(axis=1) > limit
+        alone = beyond
+        for label in (mark[rows], image[rows]):
+            share = np.bincount(label, beyond) / np.maximum(np.bincount(label), 1)
+            alone = alone & (share[label] < 0.25)
+        sound.append(1.0 - alone)
+    return tuple(sound)
 
 
 def _accept(
