@@ -13,6 +13,7 @@ from jaxvm.discover.diagnosis import Finding
 from jaxvm.discover.select import evidence, identity
 from jaxvm.network.scene import Scene
 from jaxvm.physics.effects import Effect
+from jaxvm.physics.forms import FORMS
 from jaxvm.solve.adjust import Adjustment
 from jaxvm.solve.covariance import wald_drops
 
@@ -51,7 +52,7 @@ def rename(
                 continue
             effects = list(current.scene.fitted_effects())
             own = effects[given + k]
-            columns = len(other.group.terms) * (own.n_columns // len(own.terms))
+            columns = len(other.group.terms) * len(FORMS[other.course.form].bases)
             effects[given + k] = other.effect(np.zeros(columns))
             tried = fit(_with(current.scene, tuple(effects)))
             if not tried.converged:
