@@ -1,9 +1,12 @@
 """jaxvm (JAX videometrics): measure with networks of cameras, find the physics a model left out.
 
 Double precision is switched on when the package is imported: photogrammetric normal equations
-need it. XLA's thread pool inside one CPU operation is switched off unless XLA_FLAGS speaks of it:
-it brings nothing for the many small blocks here, and can lock up for ever on machines with few
-cores.
+need it. Three settings of the threads below are made unless the environment already has them:
+
+- XLA runs and waits in one pool of as many threads as there are cores (NPROC); with two cores, two
+  batched triangular solves that wait for each other's helpers lock up for ever. Eight are enough.
+- OpenBLAS must not start threads for matrices of 30 rows: it made them 200 times slower.
+- XLA's own threads inside one operation bring nothing for the many small blocks here.
 """
 
 import os
@@ -11,6 +14,8 @@ import os
 _FLAG = "--xla_cpu_multi_thread_eigen"
 if _FLAG not in os.environ.get("XLA_FLAGS", ""):
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_FLAG}=false".strip()
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("NPROC", str(max(8, os.cpu_count() or 1)))
 
 import jax  # noqa: E402
 
