@@ -5,12 +5,15 @@ A *group* is what enters where (terms), a *course* how it runs in time (driver, 
 family is scored by the same compiled kernel.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
+from jaxvm.discover.curves import CURVED, curved_drivers, image_map, plate_map
 from jaxvm.network.scene import Scene
 from jaxvm.physics.catalogue import CATALOGUE, Entry, entries_for
+from jaxvm.physics.drivers import channel_kind
 from jaxvm.physics.effects import Effect, Scope, Term
 from jaxvm.physics.forms import FORMS
 from jaxvm.physics.ports import PORTS
@@ -45,6 +48,9 @@ _PATTERNS: tuple[tuple[str, str, tuple[float, ...]], ...] = (
 )
 _PATTERNED_PORTS = ("detect.u", "detect.v", "sensor.focal", "target.point_z")
 _RADIAL_KNOTS = np.linspace(0.0, 1.0, 7)
+
+_MOST_OF_MARKS = 3000
+"""Hypotheses about single marks; where marks and instants are many, fewer instants are asked."""
 
 
 @dataclass(frozen=True)
@@ -93,12 +99,17 @@ class Family:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """One member of a family."""
+    """One member of a family.
+
+    `alternatives` is the number of others of its kind that were asked along (drivers and forms of
+    the same kind, marks): its own prior is the smaller, the more there were.
+    """
 
     group: Group
     course: Course
     scope: Scope
     entries: tuple[Entry, ...]
+    alternatives: int = 1
 
     def effect(self, amplitudes) -> Effect:
         """The hypothesis as an effect with given amplitudes."""
@@ -140,33 +151,40 @@ def enumerate_hypotheses(scene: Scene) -> tuple[Family, ...]:
         if port.name not in ("detect.u", "detect.v")
     ]
     patterned = [
-        Group((Term(port, driver, basis, constants),), "camera")
+        Group((Term(port, driver, basis, constants),), _entity(port))
         for port in _PATTERNED_PORTS
         for driver, basis, constants in _PATTERNS
     ]
-    named = {1: [], 2: [], 3: []}
-    for entry in CATALOGUE:
-        for terms in entry.groups:
-            group = Group(terms, entry.entity)
-            plain = len(terms) == 1 and terms[0].driver == "one"
-            if entry.entity != "mark" and not plain and group not in named[len(terms)]:
-                named[len(terms)].append(group)
+    named = [
+        Group(terms, entry.entity)
+        for entry in CATALOGUE
+        if entry.entity != "mark"
+        for terms in entry.groups
+    ]
+    # Several ports at once follow every course; named patterns over observations do not change.
+    listed = {*single, *patterned}
+    named = [group for group in dict.fromkeys(named) if group not in listed]
+    fixed = [group for group in named if _is_patterned(group)]
+    moving = [group for group in named if group not in fixed]
     radial = Group(
         tuple(Term("sensor.focal", "radius", "bump", (float(c), 1 / 6)) for c in _RADIAL_KNOTS),
         "camera",
     )
     by_bases = {n: [c for c in courses if len(FORMS[c.form].bases) == n] for n in (1, 2)}
     constant = [Course("constant", "constant")]
-    once = [group for group in named[1] if group not in patterned]
+    marks = _marks(scene)
     candidates = [
         (single, by_bases[1]),
         (single, by_bases[2]),
-        (patterned + once, constant),
-        (named[2], by_bases[1]),
-        (named[2], by_bases[2]),
-        (named[3], by_bases[1]),
-        (_marks(scene), constant),
+        (patterned + _of_size(fixed, 1), constant),
+        (_of_size(fixed, 2), constant),
+        (_of_size(fixed, 3), constant),
+        (_of_size(moving, 2), by_bases[1]),
+        (_of_size(moving, 2), by_bases[2]),
+        (_of_size(moving, 3), by_bases[1]),
+        (marks, _courses_of_marks(courses, len(marks))),
         ([radial], constant),
+        *_free_forms(scene, constant),
     ]
     families = (_family(groups, own, scopes) for groups, own in candidates if groups and own)
     return tuple(family for family in families if family.valid.any())
@@ -182,10 +200,14 @@ def member(family: Family, index: tuple[int, int, int], scene: Scene) -> Hypothe
     if group.mark is not None:
         target = scene.model.targets[group.mark[0]]
         scope = Scope(target=(target.name,), point=(target.point_names[group.mark[1]],))
-        entries = tuple(entry for entry in CATALOGUE if entry.entity == "mark")
-        return Hypothesis(group, course, scope, entries)
     kind = driver_kind(scene, course.driver)
-    return Hypothesis(group, course, scope, entries_for(group.terms, kind, course.form))
+    entries = entries_for(group.terms, kind, course.form, channel_kind(course.driver))
+    asked = len(
+        {(c.driver, c.form) for c in family.courses if driver_kind(scene, c.driver) == kind}
+    )
+    if group.mark is not None:
+        asked *= len(family.groups)
+    return Hypothesis(group, course, scope, entries, asked)
 
 
 def driver_kind(scene: Scene, driver: str) -> str:
@@ -208,7 +230,18 @@ def _family(groups, courses, scopes) -> Family:
                 if course.driver.startswith("time since power-on of "):
                     camera = course.driver.removeprefix("time since power-on of ")
                     valid[g, c, s] &= scope.camera == (camera,)
-    return Family(tuple(groups), tuple(courses), tuple(scopes), valid)
+    # What nothing in this recording has (a rangefinder, say) is not computed either.
+    asked = np.flatnonzero(valid.any(axis=(1, 2)))
+    kept = tuple(groups[g] for g in asked)
+    return Family(kept, tuple(courses), tuple(scopes), valid[asked])
+
+
+def _is_patterned(group: Group) -> bool:
+    return any(term.driver != "one" for term in group.terms)
+
+
+def _of_size(groups: list[Group], n_terms: int) -> list[Group]:
+    return [group for group in groups if len(group.terms) == n_terms]
 
 
 def _entity(port: str) -> str:
@@ -291,6 +324,21 @@ def _courses_of_time(name: str, since: np.ndarray, span: float, spacing: float) 
     ]
 
 
+def _free_forms(scene: Scene, constant: list[Course]):
+    """Curves of ports with time or a quantity, maps over the image and over plates."""
+    drivers = curved_drivers(scene)
+    curves = [Course(name, "curve", constants) for name, constants in drivers]
+    for n in (1, 2, 3):
+        groups = [
+            Group(tuple(Term(port) for port in ports), _entity(ports[0]))
+            for ports in CURVED
+            if len(ports) == n
+        ]
+        yield groups, curves
+    yield [Group(image_map(), "camera")], constant
+    yield [Group(plate_map(), "target")], constant
+
+
 def _marks(scene: Scene) -> list[Group]:
     groups = []
     terms = next(entry for entry in CATALOGUE if entry.entity == "mark").groups[0]
@@ -299,3 +347,13 @@ def _marks(scene: Scene) -> list[Group]:
             continue
         groups += [Group(terms, "mark", (t, p)) for p in range(len(target.point_names))]
     return groups
+
+
+def _courses_of_marks(courses: list[Course], n_marks: int) -> list[Course]:
+    """A mark sits wrongly always, from a moment on, or ever more slowly on its adhesive."""
+    slow = [
+        [course for course in courses if course.driver == "time" and course.form == form]
+        for form in ("step", "onset", "creep")
+    ]
+    every = math.ceil(max(n_marks * sum(map(len, slow)) / _MOST_OF_MARKS, 1.0))
+    return [courses[0], *(course for own in slow for course in own[::every])]

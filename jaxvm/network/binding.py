@@ -10,12 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvm.network.factors import PixelFactor, PriorFactor
+from jaxvm.network.factors import PixelFactor, PriorFactor, RangeFactor
 from jaxvm.network.residual import Network, parts_of
 from jaxvm.network.tables import Tables
-from jaxvm.physics.chain import Sight
-from jaxvm.physics.drivers import all_observation_drivers, pattern
-from jaxvm.physics.effects import Scope, courses
+from jaxvm.physics.chain import Aim, Sight
+from jaxvm.physics.drivers import all_observation_drivers, all_range_drivers, pattern
+from jaxvm.physics.effects import Effect, Scope, courses
 from jaxvm.physics.forms import FORMS
 from jaxvm.physics.ports import PORTS, PortValues
 
@@ -32,28 +32,29 @@ def bind(scene: Scene) -> Scene:
         patterns = np.zeros((factor.slots.shape[0], n_columns))
         if scene.effects:
             drivers = observation_driver_table(scene, factor, rows)
-            column = 0
-            for effect in scene.effects:
-                inside = in_scope(scene, effect.scope, rows)
-                for term in effect.terms:
-                    n = len(FORMS[effect.form].bases)
-                    own = np.asarray(pattern(term, drivers))[: len(rows)] * inside
-                    patterns[: len(rows), column : column + n] = own[:, None]
-                    column += n
+            inside = [in_scope(scene, effect.scope, rows) for effect in scene.effects]
+            _fill(patterns, scene.effects, drivers, inside)
         pixels.append(eqx.tree_at(lambda f: f.pattern, factor, jnp.asarray(patterns)))
     network = eqx.tree_at(lambda n: n.pixels, network, tuple(pixels))
     if network.ranges is not None:
         patterns = np.zeros((len(network.ranges.epoch), n_columns))
-        column = 0
-        for effect in scene.effects:
-            inside = ranges_in_scope(scene, effect.scope)
-            for term in effect.terms:
-                n = len(FORMS[effect.form].bases)
-                # A pattern over the image says nothing about a rangefinder's beam.
-                patterns[:, column : column + n] = (inside * (term.driver == "one"))[:, None]
-                column += n
+        if scene.effects:
+            drivers = range_driver_table(scene, network.ranges)
+            inside = [ranges_in_scope(scene, effect.scope) for effect in scene.effects]
+            _fill(patterns, scene.effects, drivers, inside)
         network = eqx.tree_at(lambda n: n.ranges.pattern, network, jnp.asarray(patterns))
     return replace(scene, network=_with_amplitude_priors(scene, network))
+
+
+def _fill(patterns: np.ndarray, effects: tuple[Effect, ...], drivers, inside) -> None:
+    """Write the patterns of all terms and bases, one column each; `inside` are the real rows."""
+    column = 0
+    for effect, own in zip(effects, inside, strict=True):
+        n = len(FORMS[effect.form].bases)
+        for term in effect.terms:
+            values = np.asarray(pattern(term, drivers))[: len(own)] * own
+            patterns[: len(own), column : column + n] = values[:, None]
+            column += n
 
 
 def _with_amplitude_priors(scene: Scene, network: Network) -> Network:
@@ -107,6 +108,17 @@ def _driver_table(factor: PixelFactor, flat, size, up):
     plain = jax.vmap(lambda o, at: factor.local(o, at, PortValues()) + at.pixel)
     predicted = plain(own, factor.circumstances)
     return all_observation_drivers(Sight(*own), factor.circumstances, predicted, size, up)
+
+
+def range_driver_table(scene: Scene, factor: RangeFactor):
+    """Observation-like drivers of the distances at the scene's present state."""
+    return _range_driver_table(factor, scene.state.flatten())
+
+
+@eqx.filter_jit
+def _range_driver_table(factor: RangeFactor, flat):
+    own = parts_of(factor, flat)
+    return all_range_drivers(Aim(*own), factor.circumstances, factor.to_plane)
 
 
 def in_scope(scene: Scene, scope: Scope, rows: np.ndarray) -> np.ndarray:

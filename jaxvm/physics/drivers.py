@@ -9,6 +9,7 @@ average out.)
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,9 +17,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxvm.geometry.poses import pose_from_vector
-from jaxvm.physics.chain import Circumstances, Sight
+from jaxvm.physics.chain import Aim, Circumstances, Sight, predict_range
 from jaxvm.physics.effects import Channels, Term
-from jaxvm.physics.forms import BASES
+from jaxvm.physics.forms import BASES, bump
+from jaxvm.physics.ports import PortValues
 
 OBSERVATION_DRIVERS: dict[str, str] = {
     "one": "1",
@@ -41,10 +43,52 @@ OBSERVATION_DRIVERS: dict[str, str] = {
     "up_x": "1",
     "up_y": "1",
     "up_z": "1",
+    "target_up_x": "1",
+    "target_up_y": "1",
+    "target_up_z": "1",
 }
 """Observation-like drivers and their units."""
 
+PLANES: dict[str, tuple[str, str, float]] = {
+    "image": ("image_x", "image_y", 0.4),
+    "plate": ("target_x", "target_y", 0.5),
+}
+"""Two observation-like drivers together, and the spacing of the tiles of a map over them."""
+
 OBSERVATION_DRIVER_INDEX = {name: i for i, name in enumerate(OBSERVATION_DRIVERS)}
+
+
+class ChannelUnit(NamedTuple):
+    """What the unit at the end of a channel's name says: the kind of quantity, and how it reads."""
+
+    kind: str
+    unit: str
+
+
+CHANNEL_UNITS: dict[str, ChannelUnit] = {
+    "_degC": ChannelUnit("temperature", "K"),  # an effect counts differences
+    "_K": ChannelUnit("temperature", "K"),
+    "_pct": ChannelUnit("humidity", "%"),
+    "_hPa": ChannelUnit("pressure", "hPa"),
+    "_W_m2": ChannelUnit("irradiance", "W/m²"),
+    "_m_s": ChannelUnit("wind", "m/s"),
+    "_K_per_m": ChannelUnit("gradient", "K/m"),
+    "_ms": ChannelUnit("exposure", "ms"),
+    "_Hz": ChannelUnit("frame rate", "Hz"),
+    "_lux": ChannelUnit("light", "lx"),
+}
+"""Units of recorded channels by the ending of their names."""
+
+
+def channel_unit(name: str) -> ChannelUnit | None:
+    """Kind and unit of a recorded channel, None where its name does not tell."""
+    return next((known for end, known in CHANNEL_UNITS.items() if name.endswith(end)), None)
+
+
+def channel_kind(name: str) -> str:
+    """Kind of a recorded channel by its name: "temperature", "humidity", ..., else "quantity"."""
+    known = channel_unit(name)
+    return known.kind if known else "quantity"
 
 
 def observation_drivers(
@@ -74,6 +118,7 @@ def observation_drivers(
     cosine = normal @ ray
     lean = (normal - cosine * ray)[:2]
     up_cam = camera_from_world.rotation @ up
+    up_target = world_from_target.rotation.T @ up
 
     arm_world = world_from_target.rotation @ sight.point
     speed = camera_from_world.rotation @ (at.velocity[:3] + jnp.cross(at.velocity[3:], arm_world))
@@ -105,31 +150,70 @@ def observation_drivers(
             up_cam[0],
             up_cam[1],
             up_cam[2],
+            up_target[0],
+            up_target[1],
+            up_target[2],
         ]
     )
+
+
+def range_drivers(
+    aim: Aim, circumstances: Circumstances, to_plane: Float[Array, ""]
+) -> Float[Array, " drivers"]:
+    """Observation-like drivers of one distance; NaN for those that only an image has.
+
+    `incidence` is the angle between the beam and the target's normal. The beam is the instrument's
+    z axis where it meets a plane, and the line to the mark where a mark is measured.
+    """
+    finder_from_target = (
+        pose_from_vector(aim.world_from_station) @ pose_from_vector(aim.station_from_rangefinder)
+    ).inverse() @ pose_from_vector(aim.world_from_target)
+    to_mark = finder_from_target.apply(aim.point)
+    forward = jnp.array([0.0, 0.0, 1.0])
+    beam = jnp.where(to_plane > 0.5, forward, to_mark / jnp.linalg.norm(to_mark))
+    cosine = beam @ finder_from_target.rotation[:, 2]
+    distance = predict_range(aim, circumstances, to_plane, PortValues())
+    known = {
+        "one": jnp.ones(()),
+        "range": distance,
+        "inverse_range": 1.0 / distance,
+        "incidence": jnp.arccos(jnp.clip(jnp.abs(cosine), 0.0, 1.0)),
+    }
+    return jnp.stack([known.get(name, jnp.full((), jnp.nan)) for name in OBSERVATION_DRIVERS])
 
 
 def pattern(
     term: Term, drivers: Float[Array, "observations drivers"]
 ) -> Float[Array, " observations"]:
-    """Pattern of one term over a table of observations."""
+    """Pattern of one term over a table of observations; 0 where its driver has no meaning (NaN)."""
+    if term.driver in PLANES:
+        x_name, y_name, width = PLANES[term.driver]
+        spot = [
+            bump(drivers[:, OBSERVATION_DRIVER_INDEX[name]], jnp.asarray(c), jnp.asarray(width))
+            for name, c in zip((x_name, y_name), term.constants, strict=True)
+        ]
+        return jnp.nan_to_num(spot[0] * spot[1])
     x = drivers[:, OBSERVATION_DRIVER_INDEX[term.driver]]
+    known = jnp.isfinite(x)
+    x = jnp.where(known, x, 0.0)
     constants = jnp.asarray((*term.constants, 1.0, 1.0)[:2])
     basis: Callable = BASES[term.basis]
-    return basis(x, x, constants)
+    return jnp.where(known, basis(x, x, constants), 0.0)
 
 
 def build_channels(
     epoch_time: Float[np.ndarray, " epochs"],
     recorded: dict[str, Float[np.ndarray, " times"]],
     recorded_time: Float[np.ndarray, " times"] | None,
-    power_on: dict[str, float],
+    power_on: dict[str, tuple[float, ...]],
     timed: bool = True,
+    starts: Float[np.ndarray, " sessions"] | None = None,
 ) -> Channels:
     """Channels of a recording: its own, time (s since the first epoch), time since power-on.
 
-    `power_on` maps a camera to its moment of power-on on the recording's clock (s). Where only the
-    order of the epochs is known (not `timed`), there is "order" in place of "time".
+    `power_on` maps a camera to its moments of power-on on the recording's clock (s). Where only the
+    order of the epochs is known (not `timed`), there is "order" in place of "time". Where there are
+    several sessions (`starts`, s), the time since the start of each is a channel, too.
     """
     grid = epoch_time if recorded_time is None else recorded_time
     if len(grid) == 1:
@@ -141,9 +225,11 @@ def build_channels(
     if len(epoch_time) > 1:
         name = "time" if timed else "order"
         rows[name] = (name, grid - epoch_time[0])
+    if timed and starts is not None and len(starts) > 1:
+        rows["time since the session's start"] = ("time", _since(grid, starts))
     rows |= {
-        f"time since power-on of {camera}": ("power-on", grid - moment)
-        for camera, moment in power_on.items()
+        f"time since power-on of {camera}": ("power-on", _since(grid, np.asarray(moments)))
+        for camera, moments in power_on.items()
     }
     return Channels(
         time=jnp.asarray(grid, float),
@@ -154,5 +240,14 @@ def build_channels(
     )
 
 
+def _since(time: np.ndarray, moments: np.ndarray) -> np.ndarray:
+    """Time since the latest of the moments (s); negative before the first."""
+    latest = np.maximum(np.searchsorted(moments, time, side="right") - 1, 0)
+    return time - moments[latest]
+
+
 all_observation_drivers = jax.vmap(observation_drivers, in_axes=(0, 0, 0, 0, None))
 """`observation_drivers` of a table of observations."""
+
+all_range_drivers = jax.vmap(range_drivers)
+"""`range_drivers` of a table of distances."""

@@ -208,6 +208,17 @@ def capacity(effects: tuple[Effect, ...]) -> tuple[int, int]:
     return 4 * -(-columns // 4), 4 * -(-(constants + 1) // 4)
 
 
+def room_for(effects: tuple[Effect, ...], present: tuple[int, int]) -> tuple[int, int]:
+    """The present room where the effects fit in, else a much wider one (free-form curves need it).
+
+    Few sizes of room mean few compiled programs.
+    """
+    columns, constants = capacity(effects)
+    if columns <= present[0] and constants <= present[1]:
+        return present
+    return 64 * -(-columns // 64), max(16 * -(-constants // 16), present[1])
+
+
 def courses(
     table: EffectTable, constants: Float[Array, " constants"], channels: Channels
 ) -> Float[Array, "columns epochs"]:

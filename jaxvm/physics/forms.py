@@ -62,6 +62,15 @@ def bump(x: Course, centre: Float[Array, ""], width: Float[Array, ""]) -> Course
     return jnp.where(s < 1.0, inner, jnp.where(s < 2.0, outer, 0.0))
 
 
+N_KNOTS = 12
+"""Cubic B-splines of a free-form curve."""
+
+
+def _knot(k: int):
+    """The k-th B-spline of a free-form curve; the constants are its first knot and the spacing."""
+    return lambda x, t, c: bump(x, c[0] + k * c[1], c[1])
+
+
 BASES: dict[str, Callable[[Course, Course, Constants], Course]] = {
     "one": lambda x, t, c: jnp.ones_like(x),
     "linear": lambda x, t, c: x,
@@ -81,10 +90,11 @@ BASES: dict[str, Callable[[Course, Course, Constants], Course]] = {
     "sine": lambda x, t, c: jnp.sin(2.0 * jnp.pi * x / c[0]),
     "cosine": lambda x, t, c: jnp.cos(2.0 * jnp.pi * x / c[0]),
     "bump": lambda x, t, c: bump(x, c[0], c[1]),
+    **{f"knot {k}": _knot(k) for k in range(N_KNOTS)},
 }
 """All bases by name. Those that use `t` remember the past and apply to time courses only."""
 
-_PLACED = ("step", "ramp", "bump", "play")
+_PLACED = ("step", "ramp", "bump", "play", *(f"knot {k}" for k in range(N_KNOTS)))
 
 BASIS_INDEX = {name: index for index, name in enumerate(BASES)}
 
@@ -164,6 +174,15 @@ FORMS: dict[str, Form] = {
             ("sine", "cosine"),
             (Constant("period", "driver"),),
             "periodically in {driver}",
+        ),
+        Form(
+            "curve",
+            tuple(f"knot {k}" for k in range(N_KNOTS)),
+            (
+                Constant("first knot", "driver", refined=False),
+                Constant("knot spacing", "driver", refined=False),
+            ),
+            "in a free-form curve of {driver}",
         ),
     )
 }

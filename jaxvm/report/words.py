@@ -5,16 +5,17 @@ import re
 from dataclasses import dataclass
 
 from jaxvm.discover.diagnosis import Diagnosis, Finding
+from jaxvm.discover.shape import shape_words
+from jaxvm.physics.drivers import channel_unit
 from jaxvm.physics.effects import Effect
 from jaxvm.physics.forms import FORMS
+from jaxvm.physics.materials import length_of, materials_for
 from jaxvm.physics.ports import PORTS
 
 _PORT = {port.name: port for port in PORTS}
 
 _PER_DRIVER = {"linear": 1, "lag": 1, "slow lag": 1, "play": 1, "square": 2, "ramp": 1, "rate": 1}
 """Power of the driver's unit under the unit of an amplitude, by basis."""
-
-_UNITS = (("degC", "K"), ("K_per_m", "K/m"), ("W_m2", "W/m²"), ("pct", "%"), ("hPa", "hPa"))
 
 
 @dataclass(frozen=True)
@@ -31,10 +32,8 @@ def driver_unit(driver: str) -> str:
     """Unit of a driver, from the end of its name (temperature differences are in K)."""
     if driver.startswith("time"):
         return "s"
-    for ending, unit in _UNITS:
-        if driver.endswith(ending):
-            return unit
-    return driver
+    known = channel_unit(driver)
+    return known.unit if known else driver
 
 
 def parameters(effect: Effect, stds: tuple[float, ...]) -> list[Parameter]:
@@ -128,7 +127,26 @@ def size(finding: Finding, final: bool = False) -> str:
         low, high = min(values), max(values)
         unit = numbers[0].unit
         return f"a curve between {quantity(low, 0.0, unit)} and {quantity(high, 0.0, unit)}"
-    return ", ".join(f"{p.name} {quantity(p.value, p.std, p.unit)}" for p in numbers)
+    words = ", ".join(f"{p.name} {quantity(p.value, p.std, p.unit)}" for p in numbers)
+    stuff = substance(effect, numbers)
+    return f"{words}: {stuff}" if stuff else words
+
+
+def substance(effect: Effect, numbers: list[Parameter]) -> str:
+    """What grows with temperature as measured: materials of a plate, lengths of a bracket."""
+    if len(numbers) != 1 or effect.form not in ("linear", "lag"):
+        return ""
+    (grown,) = numbers
+    if effect.catalogue_id == "target-expansion" and grown.unit == "1/K":
+        std = grown.std if math.isfinite(grown.std) else 0.0
+        return " or ".join(materials_for(1e6 * grown.value, 1e6 * std)[:3])
+    if effect.catalogue_id == "bracket-growth" and grown.unit == "m/K":
+        lengths = (
+            f"{quantity(length_of(grown.value, material), 0.0, 'm')} of {material}"
+            for material in ("aluminium", "steel")
+        )
+        return "as " + " or ".join(lengths)
+    return ""
 
 
 def in_pixels(finding: Finding) -> float:
@@ -152,8 +170,17 @@ def mistaken_for(finding: Finding) -> str:
 
 def separate_by(finding: Finding) -> str:
     """The recording that would tell it from its doubles."""
+    if finding.advice:
+        best = finding.advice[0]
+        rival = finding.rivals[0].hypothesis.effect(()).name
+        return f"record {best.plan.words}: expected odds {odds(best.odds)} against “{rival}”"
     entries = finding.hypothesis.entries
     return entries[0].separate_by if entries else "another driver's range, another geometry"
+
+
+def odds(value: float) -> str:
+    """Odds to one, not more than a million."""
+    return f"{value:.1f}:1" if value < 10.0 else f"{min(value, 1e6):,.0f}:1"
 
 
 def explanation(finding: Finding) -> str:
@@ -215,11 +242,12 @@ def summary(diagnosis: Diagnosis) -> str:
     for number, finding in enumerate(diagnosis.findings, start=1):
         effect, gain = finding.effect, finding.gain
         named = "" if finding.hypothesis.entries else "   (not in the catalogue)"
+        shape = shape_words(effect)
         lines += [
             "",
             f"{number}. {effect.name}{named}",
             f"   where     {effect.scope.words()}",
-            f"   when      {when(effect)}",
+            f"   when      {when(effect)}" + (f": it {shape}" if shape else ""),
             f"   size      {size(finding)}",
             f"   explains  {100 * finding.share:.0f} % of the excess chi-square, "
             f"{in_pixels(finding):.3f} px RMS; p = {finding.p_value:.2g}, family-wise, "

@@ -1,0 +1,72 @@
+"""Free-form hypotheses: for physics that has no name in the catalogue.
+
+Curves: a port runs freely with time or with a recorded quantity (cubic B-splines). Maps: the
+detector errs, or a plate stands off its plane, by a smooth surface over the image or the plate.
+"""
+
+import numpy as np
+
+from jaxvm.network.scene import Scene
+from jaxvm.physics.drivers import PLANES
+from jaxvm.physics.effects import Term
+from jaxvm.physics.forms import N_KNOTS
+
+CURVED = (
+    ("mount.turn_x", "mount.turn_y", "mount.turn_z"),
+    ("mount.turn_x",),
+    ("mount.turn_y",),
+    ("mount.turn_z",),
+    ("mount.shift_x", "mount.shift_y", "mount.shift_z"),
+    ("station.turn_x", "station.turn_y", "station.turn_z"),
+    ("station.shift_x", "station.shift_y", "station.shift_z"),
+    ("structure.turn_x", "structure.turn_y", "structure.turn_z"),
+    ("structure.shift_x", "structure.shift_y", "structure.shift_z"),
+    ("sensor.cx", "sensor.cy"),
+    ("sensor.focal",),
+    ("lens.k1",),
+    ("target.scale",),
+    ("target.bow_x", "target.bow_y"),
+    ("medium.bend_u", "medium.bend_v"),
+    ("clock.offset",),
+    ("range.offset",),
+)
+"""Ports, together or alone, that a free-form curve may drive."""
+
+
+def curve_constants(low: float, high: float) -> tuple[float, float]:
+    """First knot and spacing of a free-form curve between two values of its driver."""
+    spacing = (high - low) / (N_KNOTS - 3)
+    return low - spacing, spacing
+
+
+def curved_drivers(scene: Scene) -> list[tuple[str, tuple[float, float]]]:
+    """Time-like drivers that a curve may follow, with the constants of the curve."""
+    channels = scene.network.channels
+    time = np.asarray(channels.epoch_time)
+    if len(time) < 2 * N_KNOTS:
+        return []
+    found = []
+    for name, kind in zip(channels.names, channels.kinds, strict=True):
+        values = np.interp(time, channels.time, channels.values[channels.index(name)])
+        if kind in ("time", "quantity") and np.ptp(values) > 0.0:
+            found.append((name, curve_constants(float(values.min()), float(values.max()))))
+    return found
+
+
+def image_map() -> tuple[Term, ...]:
+    """A smooth map of errors of the detector, along u and along v."""
+    return _tiles("detect.u", "image", 5, 4) + _tiles("detect.v", "image", 5, 4)
+
+
+def plate_map() -> tuple[Term, ...]:
+    """A smooth surface by which a plate stands off its plane."""
+    return _tiles("target.point_z", "plate", 5, 5)
+
+
+def _tiles(port: str, plane: str, columns: int, rows: int) -> tuple[Term, ...]:
+    width = PLANES[plane][2]
+    return tuple(
+        Term(port, plane, "tile", (width * (i - (columns - 1) / 2), width * (j - (rows - 1) / 2)))
+        for j in range(rows)
+        for i in range(columns)
+    )

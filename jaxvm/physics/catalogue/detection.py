@@ -1,0 +1,43 @@
+"""Named physics of the detection of marks in images."""
+
+from jaxvm.physics.catalogue.entry import ALWAYS, Entry, alternatives, pair
+from jaxvm.physics.effects import Term
+
+
+def _phase(basis: str, period: float):
+    """A bias of both coordinates that is periodic in pixels, then of each alone."""
+    return alternatives(*(Term(f"detect.{a}", f"pixel_{a}", basis, (period,)) for a in "uv"))
+
+
+DETECTION: tuple[Entry, ...] = (
+    Entry(
+        "pixel-locking", "the detector locks to the pixel grid", (66,),
+        _phase("sine", 1.0), ALWAYS, ALWAYS, "camera",
+        (2e-3, 3e-1), "noise", "slow motion over a few pixels, slight defocus",
+        "The centre of a mark is drawn towards pixel centres or edges. The bias has a period of "
+        "one pixel.",
+    ),
+    Entry(
+        "demosaicing", "the colour filter biases the detector", (75,),
+        (*_phase("sine", 2.0), *_phase("cosine", 2.0)), ALWAYS, ALWAYS, "camera",
+        (5e-3, 5e-1), "pixel locking", "one colour channel, a monochrome camera",
+        "The colours were interpolated from every second pixel, or sharpening did the same. The "
+        "bias of a mark's centre has a period of two pixels.",
+    ),
+    Entry(
+        "light-bias", "the detector's bias follows the light", (67, 68, 69),
+        pair("sensor.cx", "sensor.cy"), ("irradiance", "light"), ("linear",), "camera",
+        (1e-6, 1e-2), "walk of the principal point", "switch a lamp at constant temperature",
+        "Brightness, background and shadows move the measured centres of the marks. The shift "
+        "follows the light at once, and not the temperature.",
+    ),
+    Entry(
+        "mark-eccentricity", "ellipse centres are taken for mark centres", (65,),
+        (tuple(Term(f"detect.{a}", f"incidence_{a}", "linear") for a in "uv"),),
+        ALWAYS, ALWAYS, "camera",
+        (5e-3, 5.0), "displaced marks", "marks of two sizes",
+        "The centre of a circle's image is not the image of its centre. The error points along "
+        "the tilt of the target and grows with the square of the mark's size.",
+    ),
+)  # fmt: skip
+"""Named physics of detection."""

@@ -1,0 +1,76 @@
+"""What an entry of the catalogue says, and the groups of terms that many entries share."""
+
+from dataclasses import dataclass
+
+from jaxvm.physics.effects import Term
+
+Terms = tuple[Term, ...]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One named effect.
+
+    Attributes:
+        id: stable key.
+        physics: the finding in words.
+        rows: numbers of the rows of PHYSICS.md that this entry is the right answer for; none where
+            it goes beyond them.
+        groups: alternatives of terms that share one amplitude vector; the first is the fullest.
+        drivers: kinds of time-like drivers: "constant", "time", "power-on", a kind of recorded
+            channel (`jaxvm.physics.drivers.CHANNEL_UNITS`: "temperature", ...), or "quantity", any
+            recorded channel.
+        forms: forms that the course may take, with any of the drivers.
+        entity: what has it: "camera", "station", "target", "mark" or "rangefinder".
+        plausible: smallest and largest size that is met in practice, in the unit of the first port
+            (per unit of the driver where it has one).
+        mistaken_for: what looks alike.
+        separate_by: the recording that tells them apart.
+        explanation: two sentences for an engineer.
+    """
+
+    id: str
+    physics: str
+    rows: tuple[int, ...]
+    groups: tuple[Terms, ...]
+    drivers: tuple[str, ...]
+    forms: tuple[str, ...]
+    entity: str
+    plausible: tuple[float, float]
+    mistaken_for: str
+    separate_by: str
+    explanation: str
+
+
+THERMAL = ("linear", "lag", "two lags")
+"""Forms of what follows a quantity, at once or late."""
+
+SETTLING = ("linear", "onset", "creep", "ramp")
+"""Forms of what moves slowly one way."""
+
+ALWAYS = ("constant",)
+"""Driver and form of what does not change."""
+
+
+def plain(*ports: str) -> Terms:
+    """Ports that act on all observations alike."""
+    return tuple(Term(port) for port in ports)
+
+
+def axes(*prefixes: str) -> tuple[Terms, ...]:
+    """Vector ports: all three components together, then each alone."""
+    groups: tuple[Terms, ...] = ()
+    for prefix in prefixes:
+        names = [f"{prefix}_{axis}" for axis in "xyz"]
+        groups += (plain(*names), *map(plain, names))
+    return groups
+
+
+def pair(a: str, b: str) -> tuple[Terms, ...]:
+    """Two ports together, then each alone."""
+    return (plain(a, b), plain(a), plain(b))
+
+
+def alternatives(*terms: Term) -> tuple[Terms, ...]:
+    """Patterned terms together, then each alone."""
+    return (terms, *((term,) for term in terms))

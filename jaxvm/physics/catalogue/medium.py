@@ -1,0 +1,53 @@
+"""Named physics between target and lens: air and windows."""
+
+from jaxvm.physics.catalogue.entry import ALWAYS, THERMAL, Entry, plain
+
+_AIR = ("constant", "gradient", "temperature", "irradiance")
+_AIR_FORMS = ("constant", "linear", "lag")
+
+MEDIUM: tuple[Entry, ...] = (
+    Entry(
+        "air-bending", "the air bends the rays", (16,),
+        (plain("medium.bend_v", "medium.bend_u"), plain("medium.bend_v")),
+        _AIR, _AIR_FORMS, "station",
+        (1e-10, 1e-5), "turn of the mount", "watch targets at several ranges",
+        "A gradient of temperature makes a gradient of the refractive index, and rays become "
+        "arcs. The shift grows with the square of the distance.",
+    ),
+    Entry(
+        "air-bending-lateral", "the air bends the rays sideways", (17,),
+        (plain("medium.bend_u"),), _AIR, _AIR_FORMS, "station",
+        (1e-10, 1e-5), "yaw of the mount", "watch targets at several ranges",
+        "A warm wall, a heater or a sunlit side makes the air warmer on one side of the path. "
+        "Rays bend away from the warm side, by the square of the distance.",
+    ),
+    Entry(
+        "window", "a plane window stands before the lens", (20,),
+        (plain("medium.window"),), ALWAYS, ALWAYS, "camera",
+        (5e-4, 3e-2), "lens distortion, entrance pupil", "near and far targets",
+        "A glass plate shifts rays without turning them. Near targets seem nearer and the field "
+        "slightly distorted.",
+    ),
+    Entry(
+        "window-inserted", "a window or filter was put before the lens", (50,),
+        (plain("medium.window"),), ("time",), ("step",), "camera",
+        (5e-4, 3e-2), "slip of the mount along the axis", "near and far targets",
+        "A cover glass or a filter came before the lens, or went, at one moment. From then on near "
+        "targets seem nearer and the field slightly distorted.",
+    ),
+    Entry(
+        "window-lens-power", "the sun makes the window a lens", (22,),
+        (plain("sensor.focal"),), ("irradiance",), THERMAL, "camera",
+        (1e-9, 1e-5), "thermal drift of the focal length", "shade the window",
+        "The sun heats the window unevenly and its middle gets another index and thickness than "
+        "its edge. The window acts as a weak lens that follows the sun.",
+    ),
+    Entry(
+        "window-heats", "the window is a lens while it warms", (22,),
+        (plain("sensor.focal"),), ("temperature",), ("rate",), "camera",
+        (1e-6, 5e-4), "thermal drift of the focal length", "hold the temperature: it goes away",
+        "While the temperature changes, middle and edge of the window or of the lens are not "
+        "equally warm. The glass is a weak lens in proportion to the rate.",
+    ),
+)  # fmt: skip
+"""Named physics of air and windows."""

@@ -1,0 +1,304 @@
+"""The catalogue: every entry is well formed, can be found, and gives the name that it should."""
+
+from dataclasses import replace
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from networks import matrix, stereo_recording, to_plane, to_point
+
+from jaxvm.discover.hypotheses import Hypothesis, driver_kind, enumerate_hypotheses, member
+from jaxvm.network.binding import range_driver_table
+from jaxvm.network.residual import residual
+from jaxvm.network.scene import Scene, build
+from jaxvm.physics.catalogue import BY_ID, CATALOGUE, entries_for
+from jaxvm.physics.catalogue.range import UNITS_M
+from jaxvm.physics.drivers import (
+    CHANNEL_UNITS,
+    OBSERVATION_DRIVER_INDEX,
+    OBSERVATION_DRIVERS,
+    channel_kind,
+    pattern,
+)
+from jaxvm.physics.effects import Effect, Scope, Term
+from jaxvm.physics.forms import BASES, FORMS
+from jaxvm.physics.materials import MATERIALS, length_of, materials_for
+from jaxvm.physics.ports import PORT_INDEX, PORTS
+from jaxvm.recording.recording import Drivers, Ranges
+from jaxvm.report.words import parameters, substance
+
+KINDS = {kind for kind, _ in CHANNEL_UNITS.values()}
+CHANNELS = {
+    "plate_degC": "temperature",
+    "body_K": "temperature",
+    "room_pct": "humidity",
+    "baro_hPa": "pressure",
+    "sun_W_m2": "irradiance",
+    "gusts_m_s": "wind",
+    "air_K_per_m": "gradient",
+    "shutter_ms": "exposure",
+    "rate_Hz": "frame rate",
+    "lamp_lux": "light",
+    "load_kN": "quantity",
+    "degC": "quantity",
+}
+
+
+# --- entries --------------------------------------------------------------------------------------
+
+
+def test_identifiers_are_unique_and_many():
+    assert len(BY_ID) == len(CATALOGUE) >= 65
+
+
+@pytest.mark.parametrize("entry", CATALOGUE, ids=lambda entry: entry.id)
+def test_entry_is_well_formed(entry):
+    assert entry.id == entry.id.lower() and " " not in entry.id
+    assert entry.physics and entry.mistaken_for and entry.separate_by
+    assert entry.explanation.endswith(".") and entry.explanation.count(". ") == 1
+    assert 0.0 < entry.plausible[0] < entry.plausible[1]
+    assert entry.rows and all(1 <= row <= 98 for row in entry.rows)
+    assert list(entry.rows) == sorted(set(entry.rows))
+    assert entry.entity in ("camera", "station", "target", "mark", "rangefinder")
+    assert set(entry.drivers) <= {"constant", "time", "power-on", "quantity"} | KINDS
+    assert set(entry.forms) <= set(FORMS)
+    assert ("constant" in entry.drivers) == ("constant" in entry.forms)
+    assert len(set(entry.groups)) == len(entry.groups)
+    units = {PORTS[PORT_INDEX[group[0].port]].unit for group in entry.groups}
+    assert units <= {"m", "rad"} or len(units) == 1 or entry.id == "radial-beyond-model"
+    for term in (term for group in entry.groups for term in group):
+        assert term.port in PORT_INDEX
+        assert term.driver in OBSERVATION_DRIVERS and term.basis in BASES
+        assert (term.driver == "one") == (term.basis == "one")
+
+
+def test_no_two_entries_claim_the_same():
+    """Of two entries that fit equally well the second would never give its name."""
+    claimed: dict[tuple, str] = {}
+    for entry in CATALOGUE:
+        for group in entry.groups:
+            for driver in entry.drivers:
+                for form in entry.forms:
+                    first = claimed.setdefault((group, driver, form), entry.id)
+                    pair = {first, entry.id}
+                    assert first == entry.id or pair in ALIKE, (pair, group, driver, form)
+
+
+ALIKE = (
+    {"range-scale", "range-air"},
+    # Both go with the sign of the rate; backlash is the nearer thought.
+    {"mount-hysteresis", "beam-warms-unevenly"},
+)
+
+
+# --- kinds of channels ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("name", "kind"), CHANNELS.items())
+def test_kind_of_a_channel(name, kind):
+    assert channel_kind(name) == kind
+
+
+def names(terms, *args):
+    return [entry.id for entry in entries_for(terms, *args)]
+
+
+def test_the_kind_of_a_channel_decides_the_name():
+    focal, turn = (Term("sensor.focal"),), (Term("mount.turn_x"),)
+    assert names(focal, "quantity", "linear", "temperature") == ["focal-drift"]
+    assert names(focal, "quantity", "linear", "pressure") == ["focal-pressure"]
+    assert names(focal, "quantity", "linear", "irradiance") == ["window-lens-power"]
+    # A load does not heat a lens, but it bends a mount.
+    assert (
+        names(focal, "quantity", "linear", "quantity") == names(focal, "quantity", "linear") == []
+    )
+    assert names(turn, "quantity", "linear", "quantity") == ["mount-loaded"]
+    # What names the kind comes before what takes any quantity.
+    assert names(turn, "quantity", "linear", "temperature") == ["mount-turn", "mount-loaded"]
+    scale = (Term("range.scale"),)
+    assert names(scale, "quantity", "linear", "pressure") == ["range-air", "range-scale"]
+    assert names(scale, "constant", "constant") == ["range-scale"]
+    # Time is no quantity.
+    assert names(turn, "time", "linear") == ["mount-creep"]
+    assert names(turn, "power-on", "onset") == ["mount-warm-up"]
+
+
+# --- every entry can be found ---------------------------------------------------------------------
+
+
+@cache
+def logged_scene() -> Scene:
+    """Two cameras, a reference, a plate and a rangefinder, with channels of every kind."""
+    known = stereo_recording()
+    recording = known.recording
+    time = np.linspace(recording.time[0] - 1.0, recording.time[-1] + 1.0, 40)
+    rng = np.random.default_rng(1)
+    channels = {name: np.cumsum(rng.normal(size=len(time))) for name in CHANNELS}
+    cameras = tuple(replace(c, powered_on_s=(-60.0,)) for c in recording.model.cameras)
+    recording = replace(
+        recording,
+        drivers=Drivers(time, channels),
+        model=replace(recording.model, cameras=cameras),
+    )
+    return known.true_scene(recording)
+
+
+@cache
+def first_names() -> dict[str, Hypothesis]:
+    """For each entry that gives its name to some hypothesis: one such hypothesis."""
+    scene, found = logged_scene(), {}
+    for family in enumerate_hypotheses(scene):
+        pairs = np.argwhere(family.valid.any(axis=2))
+        for g, c in pairs:
+            s = int(np.argmax(family.valid[g, c]))
+            hypothesis = member(family, (g, c, s), scene)
+            for entry in hypothesis.entries[:1]:
+                found.setdefault(entry.id, hypothesis)
+    return found
+
+
+@pytest.mark.parametrize("entry", CATALOGUE, ids=lambda entry: entry.id)
+def test_entry_names_a_hypothesis(entry):
+    hypothesis = first_names()[entry.id]
+    assert hypothesis.effect(()).name == entry.physics
+    assert hypothesis.group.entity == entry.entity
+    scope = hypothesis.scope.as_dict()
+    assert set(scope) == ({"target", "point"} if entry.entity == "mark" else {entry.entity})
+
+
+def test_time_is_asked_of_marks_but_not_too_often():
+    scene = logged_scene()
+    marks = [f for f in enumerate_hypotheses(scene) if f.groups[0].mark is not None]
+    assert {c.form for f in marks for c in f.courses} == {"constant", "step", "onset", "creep"}
+    assert all(
+        driver_kind(scene, c.driver) in ("constant", "time") for f in marks for c in f.courses
+    )
+    assert sum(int(f.valid.sum()) for f in marks) < 4000
+    hypothesis = member(marks[0], (3, 0, 0), scene)
+    assert hypothesis.scope == Scope(target=("reference",), point=("0/3",))
+
+
+def test_what_a_recording_lacks_is_not_asked():
+    with_finder, without = (
+        enumerate_hypotheses(build(stereo_recording(with_ranges=has).recording))
+        for has in (True, False)
+    )
+
+    def ports(families):
+        return {t.port for f in families for g in f.groups for t in g.terms}
+
+    assert ports(with_finder) - ports(without) == {"range.offset", "range.scale"}
+    for family in (*with_finder, *without):
+        assert family.valid.any(axis=(1, 2)).all() and len(family.groups) == len(family.valid)
+
+
+# --- patterns over distances ----------------------------------------------------------------------
+
+
+def distances(scene: Scene) -> tuple[Ranges, np.ndarray]:
+    """The distances of a scene and their drivers."""
+    assert scene.recording.ranges is not None and scene.network.ranges is not None
+    return scene.recording.ranges, np.asarray(range_driver_table(scene, scene.network.ranges))
+
+
+def test_drivers_of_a_distance_by_hand():
+    """Distance and incidence from matrices, to a plane and to a mark; nothing of an image."""
+    known = stereo_recording(noise=0.0)
+    scene = known.true_scene()
+    (ranges, table), model = distances(scene), scene.model
+    at = OBSERVATION_DRIVER_INDEX
+    np.testing.assert_allclose(table[:, at["range"]], ranges.distance, rtol=1e-12)
+    np.testing.assert_allclose(table[:, at["inverse_range"]] * ranges.distance, 1.0, rtol=1e-12)
+    assert np.all(table[:, at["one"]] == 1.0)
+
+    beam = matrix(model.stations[0].pose) @ matrix(model.rangefinders[0].pose)
+    poses = np.asarray(known.truth["world_from_target"])
+    for row, (epoch, target, point) in enumerate(
+        zip(ranges.epoch, ranges.target, ranges.point, strict=True)
+    ):
+        plate = matrix(poses[0 if target == 0 else 1 + epoch])
+        ray = beam[:3, 2]
+        if point >= 0:
+            mark = model.targets[target].points[point]
+            ray = plate[:3, :3] @ mark + plate[:3, 3] - beam[:3, 3]
+            assert to_point(beam, plate, mark) == pytest.approx(table[row, at["range"]])
+        else:
+            assert to_plane(beam, plate) == pytest.approx(table[row, at["range"]])
+        cosine = abs(ray @ plate[:3, 2]) / np.linalg.norm(ray)
+        assert np.cos(table[row, at["incidence"]]) == pytest.approx(cosine, rel=1e-12)
+
+    meaning = {"one", "range", "inverse_range", "incidence"}
+    for driver, basis in ((d, b) for d in OBSERVATION_DRIVERS for b in ("linear", "cosine")):
+        values = pattern(Term("range.offset", driver, basis, (2.0,)), jnp.asarray(table))
+        assert np.any(values != 0.0) == (driver in meaning), driver
+
+
+@pytest.mark.parametrize(
+    ("term", "by_hand"),
+    [
+        (Term("range.offset", "range", "sine", (0.5,)), lambda rho: np.sin(4.0 * np.pi * rho)),
+        (Term("range.offset", "inverse_range", "linear"), lambda rho: 1.0 / rho),
+        (Term("range.offset", "row", "cosine", (0.5,)), lambda rho: 0.0 * rho),
+    ],
+)
+def test_a_pattern_over_distances_enters_the_residuals(term, by_hand):
+    known = stereo_recording()
+    plain = known.true_scene()
+    effect = Effect("pattern", (term,), scope=Scope(rangefinder=("lidar",)), amplitudes=(2e-3,))
+    scene = plain.with_effects((effect,))
+    before, after = (np.asarray(residual(s.state, s.network).ranges)[:, 0] for s in (plain, scene))
+    ranges, table = distances(plain)
+    distance = table[:, OBSERVATION_DRIVER_INDEX["range"]]
+    expected = 2e-3 * by_hand(distance) / ranges.sigma
+    np.testing.assert_allclose(after - before, expected, atol=1e-9)
+
+
+def test_cyclic_error_is_one_entry_with_many_units():
+    entry = BY_ID["range-cyclic"]
+    assert [group[0].constants for group in entry.groups] == [(unit,) for unit in UNITS_M]
+    assert all([t.basis for t in group] == ["sine", "cosine"] for group in entry.groups)
+
+
+def test_a_step_over_the_image_parts_it_in_the_middle():
+    table = np.zeros((4, len(OBSERVATION_DRIVERS)))
+    table[:, OBSERVATION_DRIVER_INDEX["column"]] = [-0.5, -1e-9, 1e-9, 0.5]
+    (term,) = BY_ID["sensor-stitched"].groups[0]
+    assert jax.jit(lambda t: pattern(term, t))(table).tolist() == [0.0, 0.0, 1.0, 1.0]
+
+
+# --- materials ------------------------------------------------------------------------------------
+
+
+def test_materials_of_an_expansion():
+    assert materials_for(23.4, 0.6)[0] == "aluminium"
+    assert materials_for(23.4, 0.0) == ["aluminium"]
+    assert materials_for(11.9, 0.1) == ["steel", "concrete"]
+    assert materials_for(1.2, 0.1)[:2] == ["Invar", "CFRP"]
+    assert materials_for(-30.0, 1.0) == materials_for(300.0, 10.0) == []
+    # Nothing is ruled out by a measurement that says nothing.
+    assert set(materials_for(20.0, 1000.0)) == set(MATERIALS)
+    assert all(low < high for low, high in MATERIALS.values())
+
+
+def test_length_of_a_bracket():
+    assert length_of(-2.325e-6, "aluminium") == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    ("entry", "driver", "value", "std", "words"),
+    [
+        ("target-expansion", "plate_degC", 23.4e-6, 0.6e-6, "aluminium"),
+        ("target-expansion", "plate_degC", 23.4e-6, float("nan"), "aluminium"),
+        ("target-expansion", "plate_degC", 300e-6, 1e-6, ""),
+        ("target-expansion", "sun_W_m2", 23.4e-6, 0.6e-6, ""),
+        ("bracket-growth", "ambient_degC", -2.325e-6, 1e-8, "as 100 mm of aluminium or 194 mm of"),
+        ("focal-drift", "body_degC", 23.4e-6, 0.6e-6, ""),
+    ],
+)
+def test_words_of_a_substance(entry, driver, value, std, words):
+    named = BY_ID[entry]
+    effect = Effect(named.physics, named.groups[-1], driver, "linear", catalogue_id=entry)
+    said = substance(effect, parameters(replace(effect, amplitudes=(value,)), (std,)))
+    assert said.startswith(words) and bool(said) == bool(words)
