@@ -74,16 +74,27 @@ class Scene:
         scene = replace(self, effects=effects, state=state, network=network)
         return bind(replace(scene, unknowns=free_unknowns(scene)))
 
-    def fitted_effects(self) -> tuple[Effect, ...]:
-        """The effects with the amplitudes and constants of the present state."""
-        result, column, first = [], 0, 0
-        amplitude, constant = np.asarray(self.state.amplitude), np.asarray(self.state.constant)
+    @property
+    def room(self) -> tuple[int, int]:
+        """Columns and constants that there is room for."""
+        return self.network.effects.n_columns, self.state.constant.shape[0]
+
+    def places(self) -> tuple[tuple[slice, slice], ...]:
+        """Columns and constants of each effect, in the tables of amplitudes and constants."""
+        found, column, first = [], 0, 0
         for effect in self.effects:
             n, m = effect.n_columns, len(effect.constants)
-            values = amplitude[column : column + n], constant[first : first + m]
-            result.append(effect.with_values(*values))
+            found.append((slice(column, column + n), slice(first, first + m)))
             column, first = column + n, first + m
-        return tuple(result)
+        return tuple(found)
+
+    def fitted_effects(self) -> tuple[Effect, ...]:
+        """The effects with the amplitudes and constants of the present state."""
+        amplitude, constant = np.asarray(self.state.amplitude), np.asarray(self.state.constant)
+        return tuple(
+            effect.with_values(amplitude[columns], constant[constants])
+            for effect, (columns, constants) in zip(self.effects, self.places(), strict=True)
+        )
 
 
 def build(recording: Recording, effects: tuple[Effect, ...] | None = None) -> Scene:
@@ -104,8 +115,9 @@ def build(recording: Recording, effects: tuple[Effect, ...] | None = None) -> Sc
         recording.time,
         {} if recording.drivers is None else recording.drivers.channels,
         None if recording.drivers is None else recording.drivers.time,
-        {c.name: c.powered_on_s for c in model.cameras if c.powered_on_s is not None},
+        {c.name: c.powered_on_s for c in model.cameras if c.powered_on_s},
         recording.timed,
+        recording.time[list(recording.starts)],
     )
     empty, _, _ = tabulate((), channels, 0, 1)
     nothing = np.zeros(0, int)
@@ -177,13 +189,19 @@ def _given_state(recording, station_row, target_row) -> State:
         station_from_camera=jnp.asarray(mounted),
         world_from_station=jnp.asarray(poses(model.stations, station_row)),
         world_from_target=jnp.asarray(poses(model.targets, target_row)),
-        point=jnp.asarray(np.concatenate([t.points for t in model.targets])),
+        point=jnp.asarray(_in_room(np.concatenate([t.points for t in model.targets]))),
         station_from_rangefinder=jnp.asarray(np.reshape(finders, (-1, 6)).astype(float)),
         link=jnp.asarray(np.zeros((0, 6)) if links is None or not named else links.pose[named]),
         amplitude=jnp.zeros(0),
         constant=jnp.ones(1),
         identity=jnp.zeros((1, 6)),
     )
+
+
+def _in_room(points: np.ndarray) -> np.ndarray:
+    """Points with spare rows, so that some marks more or less are no other program."""
+    spare = -len(points) % 32
+    return np.concatenate([points, np.zeros((spare, 3))])
 
 
 def _relaid(network: Network, old: Layout, new: Layout) -> Network:

@@ -14,6 +14,7 @@ from jaxvm.recording.importers import (
     import_corners_vnl,
     import_opencv_calibration,
 )
+from jaxvm.recording.join import join
 from jaxvm.recording.model import (
     Camera,
     Closure,
@@ -50,6 +51,7 @@ __all__ = [
     "import_corner_table",
     "import_corners_vnl",
     "import_opencv_calibration",
+    "join",
     "model_text",
     "open_recording",
     "read_model",

@@ -110,6 +110,17 @@ class Entry:
             self.fail(key, f"{self.title(key)} has {given}; it must be {wanted}")
         return self._numbers(key, value, wanted)
 
+    def moments(self, key: str) -> tuple[float, ...]:
+        """One number or a list of increasing ones; empty where the key is absent."""
+        if key not in self:
+            return ()
+        value = self.table[key]
+        wanted = "a number, or a list of increasing ones"
+        moments = self._numbers(key, value if isinstance(value, list) else [value], wanted)
+        if (np.diff(moments) <= 0.0).any():
+            self.fail(key, f"{self.title(key)} is {value}; it must be {wanted}")
+        return tuple(moments.tolist())
+
     def names(self, key: str) -> list[str] | None:
         if key not in self:
             return None

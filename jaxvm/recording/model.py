@@ -35,7 +35,7 @@ class Camera:
         focal_px, centre_px, distortion: known values or start values; None: start from the data.
         pose: station_from_camera; None: start from the data.
         free: subset of focal, aspect-locked-focal, centre, distortion, pose.
-        powered_on_s: time of power-on, on the clock of the epochs (s).
+        powered_on_s: moments of power-on, on the clock of the epochs (s).
     """
 
     name: str
@@ -47,7 +47,7 @@ class Camera:
     distortion: Float[np.ndarray, " n"] | None = None
     pose: Pose | None = None
     free: frozenset[str] = frozenset()
-    powered_on_s: float | None = None
+    powered_on_s: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,8 +199,9 @@ def camera_table(camera: Camera) -> dict[str, Any]:
         value = getattr(camera, key)
         if value is not None:
             table[key] = _floats(value)
-    if camera.powered_on_s is not None:
-        table["powered_on_s"] = float(camera.powered_on_s)
+    if camera.powered_on_s:
+        moments = _floats(camera.powered_on_s)
+        table["powered_on_s"] = moments[0] if len(moments) == 1 else moments
     return {**table, **_held(camera.pose, camera.free)}
 
 

@@ -156,7 +156,7 @@ def _camera(name: str, entry: Entry, station: str, pose, carries_frame: bool) ->
         distortion=distortion,
         pose=pose,
         free=free,
-        powered_on_s=entry.number("powered_on_s"),
+        powered_on_s=entry.moments("powered_on_s"),
     )
 
 

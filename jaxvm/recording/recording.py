@@ -77,6 +77,7 @@ class Recording:
         time: of the epochs (s), strictly increasing; their order where no clock was recorded.
         velocities: by target, velocity of its origin (m/s) and angular rate (rad/s), world axes.
         timed: whether `time` was recorded; otherwise only the order of the epochs is known.
+        starts: first epoch of each session; several where recordings were joined.
     """
 
     model: Model
@@ -88,6 +89,7 @@ class Recording:
     ranges: Ranges | None = None
     links: Links | None = None
     timed: bool = True
+    starts: tuple[int, ...] = (0,)
 
     def select_epochs(self, mask: Bool[np.ndarray, " epochs"]) -> "Recording":
         """The same recording with the epochs where `mask` is true.
@@ -126,7 +128,9 @@ class Recording:
             if self.ranges is None
             else _of_rows(self.ranges, mask[self.ranges.epoch], row),
             links=links,
-        )
+            starts=tuple(sorted({int(np.sum(mask[:start])) for start in self.starts
+                                 if mask[start:].any()})),
+        )  # fmt: skip
 
 
 def _of_rows(table, kept: np.ndarray, row: np.ndarray):

@@ -1,0 +1,93 @@
+"""Join recordings of the same cameras and bodies into one, to be diagnosed together."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from jaxvm.recording.model import Model
+from jaxvm.recording.recording import Drivers, Observations, Ranges, Recording
+
+PAUSE_S = 86_400.0
+"""Pause (s) between two recordings whose clocks overlap: long enough for lags to settle."""
+
+
+def join(first: Recording, second: Recording) -> Recording:
+    """Both recordings as one with two sessions.
+
+    Cameras, rangefinders and bodies of one name are the same; what is static stayed where it was,
+    what moves per epoch goes on. The second recording keeps its clock where that is later, and
+    follows after a pause otherwise. Of the drivers, those that both have are kept.
+
+    Raises:
+        ValueError: the recordings have other cameras, stations, targets, marks or rangefinders.
+    """
+    model = _common(first.model, second.model)
+    n = len(first.time)
+    ends = first.time[-1] if first.drivers is None else max(first.time[-1], first.drivers.time[-1])
+    begins = second.time[0]
+    if second.drivers is not None:
+        begins = min(begins, second.drivers.time[0])
+    later = 0.0 if begins > ends else ends + PAUSE_S - begins
+    cameras = tuple(
+        replace(a, powered_on_s=(*a.powered_on_s, *(m + later for m in b.powered_on_s)))
+        for a, b in zip(model.cameras, second.model.cameras, strict=True)
+    )
+    velocities = {
+        name: np.concatenate([_velocity(first, name), _velocity(second, name)])
+        for name in dict.fromkeys([*first.velocities, *second.velocities])
+    }
+    return Recording(
+        model=replace(model, cameras=cameras),
+        epoch_ids=np.concatenate(
+            [first.epoch_ids, second.epoch_ids + first.epoch_ids.max() + 1 - second.epoch_ids.min()]
+        ),
+        time=np.concatenate([first.time, second.time + later]),
+        velocities=velocities,
+        observations=_stacked(Observations, first.observations, second.observations, n),
+        drivers=_drivers(first, second, later),
+        ranges=_stacked(Ranges, first.ranges, second.ranges, n),
+        links=first.links,
+        timed=first.timed and second.timed,
+        starts=(*first.starts, *(n + start for start in second.starts)),
+    )
+
+
+def _common(first: Model, second: Model) -> Model:
+    kinds = ("cameras", "stations", "targets", "rangefinders")
+    for kind in kinds:
+        own, other = ([body.name for body in getattr(m, kind)] for m in (first, second))
+        if own != other:
+            raise ValueError(
+                f"the recordings have other {kind} ({', '.join(own)}; {', '.join(other)}); "
+                "only recordings of the same bodies, in the same order, can be joined"
+            )
+    for a, b in zip(first.targets, second.targets, strict=True):
+        if a.point_names != b.point_names:
+            raise ValueError(f'target "{a.name}" has other marks in the second recording')
+    return first
+
+
+def _velocity(recording: Recording, name: str) -> np.ndarray:
+    return recording.velocities.get(name, np.zeros((len(recording.time), 6)))
+
+
+def _stacked(kind, first, second, epochs: int):
+    if first is None or second is None:
+        if second is None:
+            return first
+        return replace(second, epoch=second.epoch + epochs)
+    second = replace(second, epoch=second.epoch + epochs)
+    parts = {name: np.concatenate([getattr(first, name), getattr(second, name)])
+             for name in vars(first)}  # fmt: skip
+    return kind(**parts)
+
+
+def _drivers(first: Recording, second: Recording, later: float) -> Drivers | None:
+    if first.drivers is None or second.drivers is None:
+        return None
+    a, b = first.drivers, second.drivers
+    names = [name for name in a.channels if name in b.channels]
+    return Drivers(
+        np.concatenate([a.time, b.time + later]),
+        {name: np.concatenate([a.channels[name], b.channels[name]]) for name in names},
+    )
