@@ -4,6 +4,8 @@ Families are static objects without numbers; coefficients are data. Brown-Conrad
 OpenCV's order with 0, 4, 5, 8, 12 or 14 coefficients, Kannala-Brandt (2006) as OpenCV's fisheye.
 """
 
+import abc
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -18,6 +20,7 @@ class LensFamily(eqx.Module):
     name: str = eqx.field(static=True)
     n_coefficients: int = eqx.field(static=True)
 
+    @abc.abstractmethod
     def distort(
         self,
         coefficients: Float[Array, " n"],
@@ -31,13 +34,12 @@ class LensFamily(eqx.Module):
             ray: point or direction in camera coordinates.
             extra: (k1, k2, k3, p1, p2, tilt_x, tilt_y) added to the family's own.
         """
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def undistort(
         self, coefficients: Float[Array, " n"], image_point: Float[Array, "2"]
     ) -> Float[Array, "3"]:
         """Ray of an ideal image point: the inverse of `distort`. NaN where there is none."""
-        raise NotImplementedError
 
 
 class BrownConrady(LensFamily):

@@ -5,6 +5,7 @@ A factor knows, for each of its observations, which positions of the flat state 
 after the other; the block Jacobian comes from the same local functions (`jaxvm.network.residual`).
 """
 
+import abc
 from typing import NamedTuple
 
 import equinox as eqx
@@ -18,8 +19,11 @@ from jaxvm.physics.ports import PortValues
 
 
 def rounded(n: int) -> int:
-    """The next number of the form m * 2^k with m in 8..16: at most an eighth more."""
-    step = 1 << max(int(n - 1).bit_length() - 4, 0)
+    """The next number of the form m * 2^k with m in 4..8: sizes of tables, at most a quarter more.
+
+    Few sizes mean few compiled programs.
+    """
+    step = 1 << max(int(n - 1).bit_length() - 3, 0)
     return -(-n // step) * step
 
 
@@ -73,17 +77,17 @@ class Factor(eqx.Module):
         return self.slots.shape[0]
 
     @property
+    @abc.abstractmethod
     def widths(self) -> tuple[int, ...]:
         """How many slots each parameter has: a focal length 2, a pose 6, a point 3."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def data(self):
         """PyTree of the recorded values; its leaves lead with the observations."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def local(self, own, data, ports: PortValues) -> Float[Array, " components"]:
         """Predicted minus measured of one observation, in its unit."""
-        raise NotImplementedError
 
 
 class PixelFactor(Factor):

@@ -97,19 +97,20 @@ def arrange(
     leads = free & (tie == np.arange(len(free)))
     shared = np.flatnonzero(leads & (group < 0))
     local = np.flatnonzero(leads & (group >= 0))
-    groups, member_of = np.unique(group[local], return_inverse=True)
-    order = np.argsort(member_of, kind="stable")
-    local, member_of = local[order], member_of[order]
-    sizes = np.bincount(member_of, minlength=len(groups)) if len(local) else np.zeros(0, int)
-    size = int(sizes.max()) if len(sizes) else 0
+    # A group that nothing is free in keeps its place: a missing view is no other program.
+    local = local[np.argsort(group[local], kind="stable")]
+    member_of = group[local] - group[local].min(initial=len(free))
+    n_groups = int(member_of.max(initial=-1)) + 1
+    sizes = np.bincount(member_of, minlength=n_groups)
+    size = int(sizes.max(initial=0))
     starts = np.concatenate([[0], np.cumsum(sizes)])[:-1].astype(int)
     rank = np.arange(len(local)) - (starts[member_of] if len(local) else 0)
-    n = len(shared) + len(groups) * size
+    n = len(shared) + n_groups * size
     column = np.full(len(free), n)
     column[shared] = np.arange(len(shared))
     column[local] = len(shared) + member_of * size + rank
     column = np.where(free, column[tie], n)
-    return Unknowns(column, factor, len(shared), len(groups), size, label, idle, momentary)
+    return Unknowns(column, factor, len(shared), n_groups, size, label, idle, momentary)
 
 
 def local_groups(layout: Layout, candidates: dict[str, np.ndarray], free: np.ndarray) -> np.ndarray:

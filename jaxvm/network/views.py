@@ -7,11 +7,13 @@ OpenCV's closed-form solutions; they are start values and nothing more.
 from dataclasses import dataclass
 
 import cv2
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxvm.geometry.lenses import BrownConrady, LensFamily, lens_family
+from jaxvm.network.factors import rounded
 from jaxvm.recording import Recording
 
 MIN_POINTS = 4
@@ -58,12 +60,15 @@ def rays_of_pixels(
     """Unit-z rays (camera frame) of many pixels through a lens."""
     image_points = (np.asarray(pixels) - centre) / focal
     coefficients = jnp.asarray(distortion[: family.n_coefficients])
-    rays = np.asarray(_undistort(family, coefficients, jnp.asarray(image_points)))
+    n = len(image_points)
+    padded = np.concatenate([image_points, np.zeros((rounded(n) - n, 2))])
+    rays = np.asarray(_undistort(family, coefficients, jnp.asarray(padded)))[:n]
     return rays / rays[:, 2:]
 
 
+@eqx.filter_jit
 def _undistort(family, coefficients, image_points):
-    return jax.jit(jax.vmap(lambda p: family.undistort(coefficients, p)))(image_points)
+    return jax.vmap(lambda p: family.undistort(coefficients, p))(image_points)
 
 
 def pose_of_view(points: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, float] | None:

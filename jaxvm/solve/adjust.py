@@ -57,6 +57,11 @@ class Adjustment:
         """Whether it stopped at a minimum."""
         return self.why.startswith("converged")
 
+    @property
+    def failed(self) -> bool:
+        """Whether it broke down: singular equations, or a cost that is no number."""
+        return self.why.startswith("failed") or not np.isfinite(self.cost)
+
     def residuals(self) -> Residuals:
         """Whitened residuals at the solution, without the padding of the tables."""
         padded = _residuals(self.problem, self.x)

@@ -51,22 +51,25 @@ def wald_drops(adjustment: Adjustment, groups: list[np.ndarray]) -> list[float]:
 
     Each group lists amplitudes by their number.
     """
-    problem = adjustment.problem
-    positions = problem.network.layout.all("amplitude")
-    columns = np.asarray(problem.column)[positions]
-    inverse = np.asarray(_inverse_columns(_factors(adjustment), jnp.asarray(columns)))[columns]
-    factor = np.asarray(problem.factor)[positions]
-    spread = factor[:, None] * inverse * factor
-    values = np.asarray(_flat(problem, adjustment.x))[positions]
+    spread = amplitude_covariance(adjustment)
+    values = np.asarray(adjustment.scene.state.amplitude)
     return [
         float(values[own] @ np.linalg.solve(spread[np.ix_(own, own)], values[own]))
         for own in groups
     ]
 
 
-@eqx.filter_jit
-def _flat(problem: Problem, x):
-    return problem.flat(x)
+def amplitude_covariance(
+    adjustment: Adjustment, chosen: np.ndarray | None = None
+) -> Float[np.ndarray, "columns columns"]:
+    """Covariance of the amplitudes of effects (of the chosen ones), for unit variance."""
+    problem = adjustment.problem
+    positions = problem.network.layout.all("amplitude")
+    columns = np.asarray(problem.column)[positions]
+    inverse = np.asarray(_inverse_columns(_factors(adjustment), jnp.asarray(columns)))[columns]
+    factor = np.asarray(problem.factor)[positions]
+    spread = factor[:, None] * inverse * factor
+    return spread if chosen is None else spread[np.ix_(chosen, chosen)]
 
 
 @eqx.filter_jit

@@ -51,9 +51,12 @@ def pack(factor: Factor, layout: Layout, unknowns: Unknowns) -> Packets:
     order = np.argsort(packet, kind="stable")
     starts = np.concatenate([[0], np.cumsum(counts)])[:-1]
     rank = np.arange(len(packet)) - starts[packet[order]]
-    width = rounded(counts.max(initial=1))
-    rows = np.full((len(distinct), width), factor.slots.shape[0])
+    # Sizes are rounded up, so that some missing points or views are no other program.
+    width, height = rounded(counts.max(initial=1)), rounded(len(distinct))
+    rows = np.full((height, width), factor.slots.shape[0])
     rows[packet[order], rank] = order
+    spare = np.full((height - len(distinct), distinct.shape[1]), unknowns.n)
+    distinct = np.concatenate([distinct, spare])
     return Packets(jnp.asarray(rows), jnp.asarray(distinct), tuple(int(k) for k in live))
 
 

@@ -4,6 +4,8 @@ A loss maps the squared norm s of one observation's whitened residual to rho(s),
 small residuals; its derivative is the weight of iteratively reweighted least squares.
 """
 
+import abc
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -14,13 +16,13 @@ Squares = Float[Array, " observations"]
 class Loss(eqx.Module):
     """A robust loss: its value and its derivative with respect to s."""
 
+    @abc.abstractmethod
     def value(self, square: Squares) -> Squares:
         """rho(s)."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def weight(self, square: Squares) -> Squares:
         """rho'(s), between 0 and 1."""
-        raise NotImplementedError
 
 
 class SquaredLoss(Loss):
