@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import os
 import sys
 import time
 from collections.abc import Callable
@@ -58,8 +57,24 @@ def _parser() -> argparse.ArgumentParser:
     demo.add_argument("--out", type=Path, default=Path("jaxvm-demo"), metavar="DIR")
 
     diagnose = command("diagnose", _diagnose, "find the physics that a model left out")
-    _recording_argument(diagnose)
+    diagnose.add_argument(
+        "recording",
+        nargs="+",
+        help="folder of a recording, or the name of a public one; several are diagnosed one by one",
+    )
+    _model_argument(diagnose)
+    diagnose.add_argument(
+        "--with",
+        dest="further",
+        action="append",
+        default=[],
+        metavar="RECORDING",
+        help="a further recording of the same cameras and bodies, diagnosed together with it",
+    )
     diagnose.add_argument("--out", type=Path, default=Path("jaxvm-report"), metavar="DIR")
+    diagnose.add_argument(
+        "--data-only", action="store_true", help="report.json and model.toml, no page, no figures"
+    )
     diagnose.add_argument("--every", type=_natural, default=3, help="hold out every n-th epoch")
     diagnose.add_argument("--alpha", type=float, default=0.01, help="risk of a false claim")
     diagnose.add_argument("--seed", type=_natural, default=0, help="of sign-flips and bootstrap")
@@ -107,6 +122,10 @@ def _parser() -> argparse.ArgumentParser:
 
 def _recording_argument(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("recording", help="folder of a recording, or the name of a public one")
+    _model_argument(parser)
+
+
+def _model_argument(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--model", type=Path, default=None, metavar="FILE", help="in place of its recording.toml"
     )
@@ -137,39 +156,28 @@ def _progress(options) -> Callable[[str], None]:
     return line
 
 
-def _keep_compiled() -> None:
-    """Compiled programs stay on disk, so that a second run starts at once."""
-    import jax
-    from platformdirs import user_cache_path
-
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        folder = user_cache_path("jaxvm") / f"compiled-{jax.__version__}"
-        jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-
-
-def _open(options):
+def _open(name: str, model: Path | None = None):
     """The recording that a command is about: a folder, or a public one by name."""
     from jaxvm.recording import DATASETS, open_recording, read_recording
 
-    if options.recording in DATASETS and not Path(options.recording).exists():
-        return open_recording(options.recording, options.model)
-    return read_recording(options.recording, options.model)
+    if name in DATASETS and not Path(name).exists():
+        return open_recording(name, model)
+    return read_recording(name, model)
 
 
-def _report(diagnosis, out: Path) -> tuple[dict[str, Any], str]:
+def _report(diagnosis, out: Path, data_only: bool = False) -> tuple[dict[str, Any], str]:
     from jaxvm.report import document, summary, write_report
 
-    page = write_report(diagnosis, out)
+    page = write_report(diagnosis, out, data_only)
     answer = document(diagnosis) | {"report": str(page)}
     return answer, f"{summary(diagnosis)}\n\nreport     {page}"
 
 
 def _demo(options):
     from jaxvm.demo import demo, paragraph
+    from jaxvm.solve.compiling import keep_compiled
 
-    _keep_compiled()
+    keep_compiled()
     shown = demo(options.seed, options.hide, options.size, options.out, _progress(options))
     answer, text = _report(shown.diagnosis, options.out)
     answer["hidden"] = [truth.effect for truth in shown.truth]
@@ -178,20 +186,44 @@ def _demo(options):
 
 
 def _diagnose(options):
-    from jaxvm.discover import diagnose
+    from jaxvm.solve.compiling import keep_compiled
 
-    _keep_compiled()
+    keep_compiled()
     if not 0.0 < options.alpha < 1.0:
         raise ValueError(f"--alpha is {options.alpha:g}; it is a probability between 0 and 1")
-    recording = _open(options)
+    if len(options.recording) == 1:
+        return _diagnose_one(options, options.recording[0], options.out)
+    if options.further:
+        raise ValueError("--with joins further recordings to one; give only one before it")
+    folders = [Path(name).name for name in options.recording]
+    twice = {folder for folder in folders if folders.count(folder) > 1}
+    if twice:
+        raise ValueError(f"two recordings are called {min(twice)}; their reports would collide")
+    answers, failed = {}, []
+    for name, folder in zip(options.recording, folders, strict=True):
+        try:
+            answers[folder], _ = _diagnose_one(options, name, options.out / folder)
+        except (ValueError, OSError) as problem:
+            print(f"jaxvm diagnose {name}: {problem}", file=sys.stderr, flush=True)
+            failed.append(folder)
+    lines = [f"{folder}: {answer['verdict']}" for folder, answer in answers.items()]
+    if failed:
+        raise ValueError(f"{len(answers)} recordings diagnosed; not so {', '.join(failed)}")
+    return answers, "\n".join(lines)
+
+
+def _diagnose_one(options, name: str, out: Path):
+    from jaxvm.discover import diagnose
+    from jaxvm.recording import join
+
+    progress = _progress(options)
+    recording = _open(name, options.model)
+    for further in options.further:
+        recording = join(recording, _open(further))
     found = diagnose(
-        recording,
-        every=options.every,
-        alpha=options.alpha,
-        seed=options.seed,
-        progress=_progress(options),
+        recording, every=options.every, alpha=options.alpha, seed=options.seed, progress=progress
     )
-    return _report(found, options.out)
+    return _report(found, out, options.data_only)
 
 
 def _adjust(options):
@@ -201,13 +233,14 @@ def _adjust(options):
     from jaxvm.recording import model_text
     from jaxvm.recording.files import write_files
     from jaxvm.solve.adjust import adjust, pixel_rms
+    from jaxvm.solve.compiling import keep_compiled
     from jaxvm.solve.covariance import standard_deviations
     from jaxvm.solve.robust import LOSSES
 
-    _keep_compiled()
+    keep_compiled()
     progress = _progress(options)
     progress("start values from the data")
-    scene = start(build(_open(options)))
+    scene = start(build(_open(options.recording, options.model)))
     progress("adjustment")
     result = adjust(scene, options.method, LOSSES[options.loss]())
     deviations = standard_deviations(result, result.variance_factor)
@@ -267,7 +300,7 @@ def _convert(options):
 def _validate(options):
     from jaxvm.recording import describe
 
-    told = describe(_open(options))
+    told = describe(_open(options.recording, options.model))
     return {"valid": True, "contents": told}, f"valid      {told}"
 
 

@@ -20,7 +20,7 @@ from jaxvm.simulate import HIDEABLE
 @pytest.fixture
 def board(tmp_path, monkeypatch):
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "compiled"))
-    monkeypatch.setattr(jaxvm.cli, "_keep_compiled", lambda: None)
+    monkeypatch.setattr(jaxvm.solve.compiling, "keep_compiled", lambda: None)
     return write_recording(board_recording().recording, tmp_path / "board")
 
 
@@ -70,7 +70,7 @@ def test_bad_recording(command, board, tmp_path, capsys):
 )
 def test_bad_arguments(arguments, words, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(jaxvm.cli, "_keep_compiled", lambda: None)
+    monkeypatch.setattr(jaxvm.solve.compiling, "keep_compiled", lambda: None)
     assert main([*arguments, "--quiet"] if arguments[0] == "demo" else arguments) == 2
     assert words in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []

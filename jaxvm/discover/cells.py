@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxvm.network.binding import observation_driver_table
-from jaxvm.network.factors import PixelFactor, RangeFactor
+from jaxvm.network.binding import observation_driver_table, range_driver_table
+from jaxvm.network.factors import PixelFactor, RangeFactor, rounded
 from jaxvm.network.residual import port_jacobian, whitening
 from jaxvm.solve.adjust import Adjustment
 from jaxvm.solve.arrow import Arrow, factorise
@@ -54,7 +54,7 @@ class Arrangement:
     cells: Cells
     rows: np.ndarray  # [cells, width] into all observations, padded with their number
     epoch: np.ndarray  # of each cell
-    drivers: np.ndarray  # observation-like drivers of all observations
+    drivers: np.ndarray  # observation-like drivers of all observations, NaN where they have none
     starts: tuple[int, ...]  # first observation of each table (pixel tables, then ranges)
     components: int
 
@@ -104,9 +104,7 @@ def arrange(adjustment: Adjustment) -> Arrangement:
             assert ranges is not None
             first = len(scene.model.cameras) * len(scene.model.targets)
             entity = first + ranges.rangefinder * len(scene.model.targets) + ranges.target
-            blank = np.zeros((n, drivers[0].shape[1]))
-            blank[:, 0] = 1.0
-            drivers.append(blank)
+            drivers.append(np.asarray(range_driver_table(scene, factor))[:n])
         keys.append(np.stack([group, np.asarray(factor.epoch)[:n], entity], axis=1))
         pad = [(0, 0), (0, components - r.shape[1])]
         halves.append(np.pad(np.asarray(half)[:n], [*pad, (0, 0)]))
@@ -114,6 +112,9 @@ def arrange(adjustment: Adjustment) -> Arrangement:
         tangents.append(np.pad(np.asarray(tangent)[:n], [*pad, (0, 0)]))
     key = np.concatenate(keys)
     distinct, cell = np.unique(key, axis=0, return_inverse=True)
+    # The number of cells is rounded up: empty cells of no group and no epoch carry nothing.
+    spare = np.full((rounded(len(distinct)) - len(distinct), 3), -1)
+    distinct = np.concatenate([distinct, spare])
     rows = _padded_lists(cell.ravel(), len(distinct), len(key))
 
     def in_cells(parts):
@@ -131,7 +132,12 @@ def arrange(adjustment: Adjustment) -> Arrangement:
         n_local=problem.sizes[2],
     )
     return Arrangement(
-        cells, rows, distinct[:, 1], np.concatenate(drivers), tuple(starts), components
+        cells,
+        rows,
+        np.maximum(distinct[:, 1], 0),
+        np.concatenate(drivers),
+        tuple(starts),
+        components,
     )
 
 
@@ -139,7 +145,7 @@ def _padded_lists(label: np.ndarray, n_labels: int, filler: int) -> np.ndarray:
     """Positions of each label 0..n-1 as rows of equal length, filled up with `filler`."""
     kept = np.flatnonzero(label >= 0)
     counts = np.bincount(label[kept], minlength=n_labels)
-    lists = np.full((n_labels, max(int(counts.max(initial=0)), 1)), filler)
+    lists = np.full((n_labels, rounded(max(int(counts.max(initial=0)), 1))), filler)
     order = kept[np.argsort(label[kept], kind="stable")]
     first = np.concatenate([[0], np.cumsum(counts)])[:-1]
     lists[label[order], np.arange(len(order)) - first[label[order]]] = order

@@ -6,24 +6,28 @@ significant is left. No finding is claimed that does not pass on epochs which we
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from jaxvm.discover.accept import accept, short
+from jaxvm.discover.advice import advise
+from jaxvm.discover.cells import arrange
 from jaxvm.discover.diagnosis import Diagnosis, Finding, Quality
+from jaxvm.discover.gross import without_gross_errors
 from jaxvm.discover.heldout import (
     HeldOut,
-    evaluate,
-    gain,
+    Split,
     hold_out,
-    range_weights_of,
-    weights_of,
+    split,
 )
-from jaxvm.discover.hypotheses import Hypothesis, enumerate_hypotheses
+from jaxvm.discover.hypotheses import enumerate_hypotheses
 from jaxvm.discover.locate import ResidualTable, locate, residual_table
+from jaxvm.discover.noise import LONGEST, memory, multipliers
 from jaxvm.discover.revise import prune, rename
-from jaxvm.discover.score import score
-from jaxvm.discover.select import Candidate, identity, refit, rivals, shortlist
+from jaxvm.discover.scopes import sharing
+from jaxvm.discover.score import battery, score_residuals
+from jaxvm.discover.select import rivals, shortlist, stacked
 from jaxvm.discover.visible import smallest_visible
 from jaxvm.network.scene import Scene, build
 from jaxvm.network.start import start
@@ -36,25 +40,9 @@ from jaxvm.solve.snooping import robust_variance
 ALPHA = 0.01
 """Family-wise probability to claim something where nothing is hidden."""
 
-GROSS = 12.0
-"""Residuals beyond this many robust standard deviations are mistakes, not physics."""
-
 _ROOM = (16, 8)
-_CANDIDATES = 4
-_NEAR = 30.0
-_TIE = 0.05
-_OPEN = 100.0, 0.02
 _FLIPS = 299
-
-
-@dataclass(frozen=True)
-class _Fits:
-    """Data split and what was fitted so far."""
-
-    held: np.ndarray
-    sound: tuple[np.ndarray, ...]
-    weights: tuple[np.ndarray, ...]
-    range_weights: np.ndarray | None
+_ADVISED = 3
 
 
 def diagnose(
@@ -86,45 +74,33 @@ def diagnose(
     effects = recording.model.effects if effects is None else effects
     scene = start(build(recording, ()))
     scene = scene.with_effects(effects, _room(effects))
-    held = hold_out(scene, every)
-    everything = tuple(np.ones(len(rows)) for rows in scene.tables)
     progress("fit of the plain model")
-    split = _split(scene, held, everything)
-    base = _fit(scene, split, check=True)
-    sound = _sound(base, scene, held, everything)
-    n_rejected = int(sum(np.sum(good == 0) for good in sound))
-    split = _split(scene, held, sound)
-    if n_rejected:
-        base = _fit(base.scene, split)
-    plain_heldout = evaluate(base.scene, held, sound)
-    base = replace(base, scene=plain_heldout.scene)
-    plain = base
-    n = sum(int(w.sum()) * 2 for w in split.weights)
+    parts, plain, n_rejected = _plain_fit(scene, every)
+    plain, plain_heldout = parts.proven(plain)
 
-    def fit(scene: Scene) -> Adjustment:
-        return _fit(scene, split)
-
-    current, best_heldout = base, plain_heldout
+    current, best_heldout = plain, plain_heldout
     findings: list[Finding] = []
     hopeless: set = set()
-    unproven, p_value, ranking = "", 1.0, None
+    unproven, p_value, families = "", 1.0, enumerate_hypotheses(plain.scene)
+    signs = multipliers(len(parts.held), 1, _FLIPS, seed)
+    asked = None
     while True:
         progress(f"scoring hypotheses (round {len(findings) + 1})")
-        families = enumerate_hypotheses(current.scene)
         variance = robust_variance(current)
-        ranking, arrangement = score(current, families, variance, _FLIPS, seed)
+        arrangement = arrange(current)
+        asked = battery(current.scene, arrangement, families) if asked is None else asked
+        ranking = score_residuals(current.scene, arrangement, asked, variance, signs)
         p_value = ranking.p_value(ranking.best_z())
         if p_value > alpha or len(findings) == max_findings:
             break
         progress(f"{ranking.n} hypotheses, p = {p_value:.3g}: refitting the leading ones")
-        leading = shortlist(ranking, current.scene, variance, n, 12)
-        accepted = _accept(current, leading, split, n, best_heldout, held, sound, seed, hopeless)
+        leading = shortlist(ranking, current.scene, variance, parts.n, 12)
+        accepted = accept(current, leading, parts, best_heldout, seed, hopeless)
         if isinstance(accepted, str):
             unproven = accepted
             break
-        chosen, doubles_too, heldout, proof = accepted
-        weight, doubles = rivals(current.scene, arrangement, ranking, chosen, current, n)
-        drop = 2.0 * (current.cost - chosen.adjustment.cost)
+        chosen = accepted.chosen
+        weight, doubles = rivals(current.scene, arrangement, asked, chosen, current, parts.n, signs)
         findings.append(
             Finding(
                 hypothesis=chosen.hypothesis,
@@ -135,43 +111,61 @@ def diagnose(
                 weight=weight,
                 rivals=tuple(doubles[:8]),
                 p_value=p_value,
+                p_independent=p_value,
+                z=ranking.best_z(),
                 n_hypotheses=ranking.n,
-                drop=drop,
+                drop=2.0 * (current.cost - chosen.adjustment.cost),
                 share=0.0,
-                before=_fitted_residuals(current, split),
-                after=_fitted_residuals(chosen.adjustment, split),
-                gain=proof,
-                ranking=tuple((_short(h), e) for h, e, _ in leading),
-                doubles=doubles_too,
+                before=parts.residuals(current),
+                after=parts.residuals(chosen.adjustment),
+                gain=accepted.gain,
+                ranking=tuple((short(h), e) for h, e, _ in leading),
+                doubles=accepted.near,
                 chosen=next(k for k, (h, _, _) in enumerate(leading) if h is chosen.hypothesis),
             )
         )
         progress(f"found: {chosen.effect.name} ({chosen.effect.scope.words()})")
-        current, best_heldout = replace(chosen.adjustment, scene=heldout.scene), heldout
+        best_heldout = accepted.heldout
+        current = replace(chosen.adjustment, scene=best_heldout.scene)
         kept = len(findings)
-        current, findings = prune(current, findings, n, fit)
+        current, findings = prune(current, findings, parts.n, parts.fit)
         if len(findings) < kept:
-            current, best_heldout = _proven(current, held, sound)
+            current, best_heldout = parts.proven(current)
+        findings = _confirmed(findings, current, arrangement, asked, parts, seed)
+        if len(findings) > 1 and min(f.p_value for f in findings[-2:]) > alpha:
+            break
 
+    unconfirmed = [f.p_value for f in findings if f.p_value > alpha]
+    if unconfirmed:
+        p_value = min(unconfirmed)
+        current, findings = _only_confirmed(current, findings, alpha, parts)
+        current, best_heldout = parts.proven(current)
     names = [finding.hypothesis for finding in findings]
     if p_value > alpha:
         # While something is left, names can't be decided any better than when they were found.
-        current, findings = rename(current, findings, n, fit)
+        current, findings = rename(current, findings, parts.n, parts.fit)
     if [finding.hypothesis for finding in findings] != names:
-        current, best_heldout = _proven(current, held, sound)
+        current, best_heldout = parts.proven(current)
         deviations = _deviations(current)[len(effects) :]
         findings = [
             replace(f, stds=f.stds or own) for f, own in zip(findings, deviations, strict=True)
         ]
 
     progress("final fit to all epochs")
-    whole = tuple(sound)
-    final = _with_best_instants(_fit(current.scene, _Fits(held, sound, whole, None)), whole)
+    final = adjust(current.scene, weights=parts.sound, check=False)
+    final = _with_best_instants(final, parts.sound)
     excess = 2.0 * plain.cost - current.variance_factor * plain.degrees_of_freedom
     findings = [replace(f, share=float(f.drop / max(excess, 1e-9))) for f in findings]
     findings = _with_final_values(final, findings, len(effects))
-    before = _table(plain, plain_heldout, scene, sound)
-    after = _table(final, None, scene, sound)
+    findings = [
+        replace(f, sharing=sharing(current, len(effects) + k, parts))
+        for k, f in enumerate(findings)
+    ]
+    if any(finding.rivals for finding in findings):
+        progress("weighing further recordings")
+    findings = [_with_advice(final, f, len(effects) + k, parts) for k, f in enumerate(findings)]
+    before = _table(plain, plain_heldout, scene, parts.sound)
+    after = _table(final, None, scene, parts.sound)
     noise = np.sqrt(robust_variance(final)) * reference_sigma(scene)
     significant = p_value <= alpha
     return Diagnosis(
@@ -187,7 +181,7 @@ def diagnose(
         located_left=tuple(locate(final.scene, after)[:8]),
         before=before,
         after=after,
-        held=held,
+        held=parts.held,
         heldout_before=plain_heldout,
         heldout_after=best_heldout,
         scene=final.scene,
@@ -199,106 +193,66 @@ def diagnose(
     )
 
 
-def _proven(current: Adjustment, held, sound) -> tuple[Adjustment, HeldOut]:
-    """The fit with its held-out epochs evaluated and their poses taken over."""
-    heldout = evaluate(current.scene, held, sound)
-    return replace(current, scene=heldout.scene), heldout
+def _with_advice(final: Adjustment, finding: Finding, place: int, parts: Split) -> Finding:
+    """A finding with the further recordings that would tell it from its leading rivals."""
+    if not finding.rivals:
+        return finding
+    leading = tuple(rival.hypothesis for rival in finding.rivals[:_ADVISED])
+    found = advise(final.scene, parts.sound, place, leading, final.variance_factor)
+    return replace(finding, advice=tuple(found))
+
+
+def _plain_fit(scene: Scene, every: int) -> tuple[Split, Adjustment, int]:
+    """The split, the plain model fitted to it, and the number of gross errors set aside."""
+    held = hold_out(scene, every)
+    parts = split(scene, held, tuple(np.ones(len(rows)) for rows in scene.tables))
+    fitted = parts.fit(scene, check=True)
+    fitted, parts, n_rejected = without_gross_errors(fitted, parts)
+    return parts, fitted, n_rejected
+
+
+def _confirmed(
+    findings: list[Finding], current: Adjustment, arrangement, asked, parts: Split, seed: int
+) -> list[Finding]:
+    """Findings with their p-values under noise that remembers as long as what is left now.
+
+    Noise with a memory looks like a smooth effect, and so does an effect that is not found yet:
+    that is why earlier findings are looked at again after each new one.
+    """
+    scene = current.scene
+    window = memory(scene, parts.residuals(current))
+    if window == 1:
+        return [replace(f, p_value=f.p_independent) for f in findings]
+    n_epochs = len(scene.recording.time)
+    window = min(2 * window, max(int(LONGEST * n_epochs), 2))
+    remembering = multipliers(n_epochs, window, _FLIPS, seed)
+    left = score_residuals(
+        scene,
+        arrangement,
+        asked,
+        robust_variance(current),
+        remembering,
+        residual=stacked(current),
+    )
+    return [replace(f, p_value=max(left.p_value(f.z), f.p_independent)) for f in findings]
+
+
+def _only_confirmed(
+    current: Adjustment, findings: list[Finding], alpha: float, parts: Split
+) -> tuple[Adjustment, list[Finding]]:
+    """The model without the findings that noise with a memory explains."""
+    given = len(current.scene.effects) - len(findings)
+    effects = current.scene.fitted_effects()
+    kept = [k for k, finding in enumerate(findings) if finding.p_value <= alpha]
+    effects = (*effects[:given], *(effects[given + k] for k in kept))
+    current = parts.fit(current.scene.with_effects(effects, current.scene.room))
+    return current, [findings[k] for k in kept]
 
 
 def _room(effects: tuple[Effect, ...]) -> tuple[int, int]:
     """Room for the effects given and those to be found; the same for few of them."""
     columns, constants = capacity(effects)
     return max(_ROOM[0], columns + 8), max(_ROOM[1], constants + 3)
-
-
-def _split(scene: Scene, held: np.ndarray, sound) -> _Fits:
-    return _Fits(held, sound, weights_of(scene, ~held, sound), range_weights_of(scene, ~held))
-
-
-def _fit(scene: Scene, split: _Fits, check: bool = False) -> Adjustment:
-    return adjust(scene, weights=split.weights, range_weights=split.range_weights, check=check)
-
-
-def _sound(base: Adjustment, scene: Scene, held, everything) -> tuple[np.ndarray, ...]:
-    """Observations without gross errors, by the plain model, in fitted and held-out epochs.
-
-    What goes on, in most epochs of a mark or over most of an image, is physics and stays.
-    """
-    limit = GROSS * np.sqrt(robust_variance(base))
-    inside = base.residuals()
-    momentary = adjust(
-        base.scene,
-        weights=weights_of(scene, held, everything),
-        range_weights=range_weights_of(scene, held),
-        active=scene.unknowns.of_one_epoch,
-        check=False,
-    ).residuals()
-    obs = scene.recording.observations
-    n_marks = scene.first_point[-1]
-    mark = obs.camera * n_marks + scene.first_point[obs.target] + obs.point
-    image = obs.camera * len(held) + obs.epoch
-    sound = []
-    for rows, a, b in zip(scene.tables, inside.pixels, momentary.pixels, strict=True):
-        beyond = np.maximum(np.abs(np.asarray(a)), np.abs(np.asarray(b))).max(axis=1) > limit
-        alone = beyond
-        for label in (mark[rows], image[rows]):
-            share = np.bincount(label, beyond) / np.maximum(np.bincount(label), 1)
-            alone = alone & (share[label] < 0.25)
-        sound.append(1.0 - alone)
-    return tuple(sound)
-
-
-def _accept(
-    current, leading, split: _Fits, n: int, heldout: HeldOut, held, sound, seed, hopeless: set
-):
-    """The best candidate that improves the held-out epochs, or the name of the one that failed.
-
-    `hopeless` collects what can't be fitted or does not help there; it is not tried again.
-    """
-    room = (
-        current.scene.network.effects.n_columns,
-        current.scene.state.constant.shape[0],
-    )
-
-    # One tangent foretells a drop to a few percent: only near ties of the leading one need a refit.
-    # Where none of them passes, named physics gets its turn; an unnamed effect must lead.
-    least = leading[0][1] - max(_NEAR, _TIE * abs(leading[0][1]))
-    near = [item for item in leading[:_CANDIDATES] if item[1] >= least]
-    rest = [item for item in leading[len(near) :] if item[0].entries]
-    for some in (near, rest[:_CANDIDATES]):
-        refitted = []
-        for hypothesis, _, amplitudes in some:
-            key = (identity(hypothesis), hypothesis.course)
-            if key in hopeless:
-                continue
-            candidate = refit(
-                current, hypothesis, amplitudes, room, split.weights, split.range_weights, n
-            )
-            if candidate is None or candidate.evidence <= 0.0:
-                hopeless.add(key)
-            else:
-                refitted.append(candidate)
-        for candidate in sorted(refitted, key=lambda c: -_common_evidence(c, refitted, current, n)):
-            tried = evaluate(candidate.adjustment.scene, held, sound)
-            proof = gain(heldout, tried, seed)
-            if proof.proven:
-                gap = max(_OPEN[0], _OPEN[1] * abs(candidate.evidence))
-                others = tuple(
-                    c.hypothesis
-                    for c in refitted
-                    if c is not candidate and candidate.evidence - c.evidence < gap
-                )
-                return candidate, others, tried, proof
-            hopeless.add((identity(candidate.hypothesis), candidate.hypothesis.course))
-    return _short(leading[0][0])
-
-
-def _common_evidence(candidate: Candidate, all_candidates, current: Adjustment, n: int) -> float:
-    """Evidence with one variance for all candidates: the smallest that any of them reaches."""
-    variance = min(c.adjustment.variance_factor for c in all_candidates)
-    own = candidate.adjustment.variance_factor
-    drop = 2.0 * (current.cost - candidate.adjustment.cost)
-    return candidate.evidence + drop * (1.0 / variance - 1.0 / own)
 
 
 def _with_best_instants(final: Adjustment, weights) -> Adjustment:
@@ -312,27 +266,14 @@ def _with_best_instants(final: Adjustment, weights) -> Adjustment:
         if effect.form != "step":
             continue
         place = int(np.argmin(np.abs(between - effect.constants[0])))
-        for other in between[max(place - 1, 0) : place + 2]:
+        for other in {max(place - 1, 0), min(place + 1, len(between) - 1)} - {place}:
             effects = list(final.scene.fitted_effects())
-            effects[k] = replace(effects[k], constants=(float(other),))
-            room = (final.scene.network.effects.n_columns, final.scene.state.constant.shape[0])
-            scene = final.scene.with_effects(tuple(effects), room)
+            effects[k] = replace(effects[k], constants=(float(between[other]),))
+            scene = final.scene.with_effects(tuple(effects), final.scene.room)
             tried = adjust(scene, weights=weights, rtol=1e-8, check=False)
             if tried.cost < final.cost:
                 final = tried
     return final
-
-
-def _fitted_residuals(adjustment: Adjustment, split: _Fits) -> np.ndarray:
-    scene = adjustment.scene
-    stacked = np.full((len(scene.recording.observations.epoch), 2), np.nan)
-    for rows, weight, block in zip(
-        scene.tables, split.weights, adjustment.residuals().pixels, strict=True
-    ):
-        own = np.asarray(block).copy()
-        own[weight == 0] = np.nan
-        stacked[rows] = own
-    return stacked
 
 
 def _with_final_values(final: Adjustment, findings: list[Finding], given: int) -> list[Finding]:
@@ -346,13 +287,10 @@ def _deviations(adjustment: Adjustment) -> list[tuple[float, ...]]:
     """Standard deviations of every effect: its amplitudes, then its constants."""
     deviations = standard_deviations(adjustment, robust_variance(adjustment))
     amplitude, constant = np.asarray(deviations.amplitude), np.asarray(deviations.constant)
-    result, column, first = [], 0, 0
-    for effect in adjustment.scene.effects:
-        n, m = effect.n_columns, len(effect.constants)
-        own = (*amplitude[column : column + n], *constant[first : first + m])
-        result.append(tuple(map(float, own)))
-        column, first = column + n, first + m
-    return result
+    return [
+        tuple(map(float, (*amplitude[columns], *constant[constants])))
+        for columns, constants in adjustment.scene.places()
+    ]
 
 
 def _table(fitted: Adjustment, heldout: HeldOut | None, scene: Scene, sound) -> ResidualTable:
@@ -381,12 +319,3 @@ def _verdict(findings: list[Finding], significant: bool) -> str:
     if not findings:
         return "unexplained" if significant else "consistent"
     return "partly explained" if significant else "explained"
-
-
-def _short(hypothesis: Hypothesis) -> str:
-    effect = hypothesis.effect(())
-    parts = [effect.name]
-    if effect.driver != "constant":
-        parts.append(f"{effect.form} in {effect.driver}")
-    parts.append(effect.scope.words())
-    return " · ".join(parts)

@@ -4,9 +4,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from jaxvm.discover.advice import Advice
 from jaxvm.discover.heldout import Gain, HeldOut
 from jaxvm.discover.hypotheses import Hypothesis
 from jaxvm.discover.locate import Place, ResidualTable
+from jaxvm.discover.scopes import Sharing
 from jaxvm.discover.select import Rival
 from jaxvm.network.scene import Scene
 from jaxvm.physics.effects import Effect
@@ -24,7 +26,9 @@ class Finding:
         final_effect, final_stds: the same from all epochs, together with all later findings.
         weight: posterior weight among its doubles.
         rivals: hypotheses that this recording can't tell from it.
-        p_value: family-wise.
+        p_value: family-wise, under noise that remembers as long as the residuals do.
+        p_independent: the same for noise that is independent from epoch to epoch.
+        z: the surprise with which it led its round.
         n_hypotheses: how many were tried.
         drop: of chi-square in the fitted epochs, by the stated sigmas.
         share: of the plain model's excess chi-square that it explains.
@@ -34,6 +38,8 @@ class Finding:
         ranking: leading hypotheses at the time, as (words, evidence).
         doubles: hypotheses that fitted nearly as well then; they are tried again at the end.
         chosen: place of this one among them.
+        sharing: how the bodies of its kind share it; None where there is only one.
+        advice: further recordings that would tell it from its rivals, best first.
     """
 
     hypothesis: Hypothesis
@@ -44,6 +50,8 @@ class Finding:
     weight: float
     rivals: tuple[Rival, ...]
     p_value: float
+    p_independent: float
+    z: float
     n_hypotheses: int
     drop: float
     share: float
@@ -53,6 +61,8 @@ class Finding:
     ranking: tuple[tuple[str, float], ...]
     doubles: tuple[Hypothesis, ...]
     chosen: int
+    sharing: Sharing | None = None
+    advice: tuple[Advice, ...] = ()
 
 
 @dataclass(frozen=True)

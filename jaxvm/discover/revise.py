@@ -12,7 +12,6 @@ import numpy as np
 from jaxvm.discover.diagnosis import Finding
 from jaxvm.discover.select import evidence, identity
 from jaxvm.network.scene import Scene
-from jaxvm.physics.effects import Effect
 from jaxvm.physics.forms import FORMS
 from jaxvm.solve.adjust import Adjustment
 from jaxvm.solve.covariance import wald_drops
@@ -25,18 +24,16 @@ def prune(
 ) -> tuple[Adjustment, list[Finding]]:
     """Drop an earlier finding that the later ones made superfluous (Wald test against BIC)."""
     given = len(current.scene.effects) - len(findings)
-    ends = np.cumsum([effect.n_columns for effect in current.scene.effects])
-    groups = [
-        np.arange(end - e.n_columns, end)
-        for e, end in zip(current.scene.effects, ends, strict=True)
-    ]
+    groups = [np.arange(columns.start, columns.stop) for columns, _ in current.scene.places()]
     drops = wald_drops(current, groups[given:])
     for k, (finding, drop) in enumerate(zip(findings[:-1], drops, strict=False)):
         columns = len(finding.effect.amplitudes) + len(finding.effect.constants)
         if drop / current.variance_factor < columns * np.log(n):
             effects = current.scene.fitted_effects()
             kept = (*effects[: given + k], *effects[given + k + 1 :])
-            return fit(_with(current.scene, kept)), findings[:k] + findings[k + 1 :]
+            return fit(current.scene.with_effects(kept, current.scene.room)), findings[
+                :k
+            ] + findings[k + 1 :]
     return current, findings
 
 
@@ -54,7 +51,7 @@ def rename(
             own = effects[given + k]
             columns = len(other.group.terms) * len(FORMS[other.course.form].bases)
             effects[given + k] = other.effect(np.zeros(columns))
-            tried = fit(_with(current.scene, tuple(effects)))
+            tried = fit(current.scene.with_effects(tuple(effects), current.scene.room))
             if not tried.converged:
                 continue
             variance = min(current.variance_factor, tried.variance_factor)
@@ -69,10 +66,3 @@ def rename(
                     stds=(), rivals=(), weight=1.0,
                 )  # fmt: skip
     return current, findings
-
-
-def _with(scene: Scene, effects: tuple[Effect, ...]) -> Scene:
-    """The scene with other effects, in the room that it has."""
-    return scene.with_effects(
-        effects, (scene.network.effects.n_columns, scene.state.constant.shape[0])
-    )

@@ -26,14 +26,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxvm.discover.cells import Arrangement, Cells, arrange
+from jaxvm.discover.cells import Arrangement, Cells
 from jaxvm.discover.hypotheses import Family, Hypothesis, member
 from jaxvm.network.binding import in_scope, ranges_in_scope
+from jaxvm.network.factors import rounded
 from jaxvm.network.scene import Scene
 from jaxvm.physics.drivers import pattern
+from jaxvm.physics.effects import Scope
 from jaxvm.physics.forms import BASIS_INDEX, FORMS, evaluate_basis
 from jaxvm.physics.ports import PORT_INDEX
-from jaxvm.solve.adjust import Adjustment
 
 FEWEST_EPOCHS = 3.0
 """A hypothesis that fewer epochs carry than this can't be told from a few bad images."""
@@ -87,37 +88,45 @@ class Ranking:
         return float((1 + np.sum(self.null >= z)) / (1 + len(self.null)))
 
 
-def score(
-    adjustment: Adjustment,
-    families: tuple[Family, ...],
-    variance: float,
-    repetitions: int = 499,
-    seed: int = 0,
-) -> tuple[Ranking, Arrangement]:
-    """Score all hypotheses on an adjusted scene.
+@dataclass(frozen=True)
+class Battery:
+    """Families of hypotheses with what does not change from one fit to the next.
 
-    Args:
-        adjustment: the fitted model.
+    Attributes:
         families: hypotheses.
-        variance: variance of unit weight of the residuals.
-        repetitions: sign-flips for the null distribution.
-        seed: of the sign-flips.
+        weights: for each family [pairs of course and scope, bases, cells]: the course at the
+            epoch of a cell that is in scope.
+        used: the pairs that some group of the family uses; only these are in `weights`.
     """
-    arrangement = arrange(adjustment)
-    n_epochs = len(adjustment.scene.recording.time)
-    signs = np.random.default_rng(seed).choice([-1.0, 1.0], (n_epochs, repetitions))
-    return score_residuals(adjustment.scene, arrangement, families, variance, signs), arrangement
+
+    families: tuple[Family, ...]
+    weights: tuple[np.ndarray, ...]
+    used: tuple[np.ndarray, ...]
+
+
+def battery(scene: Scene, arrangement: Arrangement, families: tuple[Family, ...]) -> Battery:
+    """Families with their courses and scopes over the cells of a scene."""
+    weights, used = [], []
+    inside = _inside(scene, arrangement, families[0].scopes)
+    for family, course in zip(families, course_tables(scene, families), strict=True):
+        used.append(np.flatnonzero(family.valid.any(axis=0).ravel()))
+        c, s = np.divmod(used[-1], len(family.scopes))
+        weights.append(course[:, :, arrangement.epoch][c] * inside[s][:, None])
+    return Battery(families, tuple(weights), tuple(used))
 
 
 def score_residuals(
     scene: Scene,
     arrangement: Arrangement,
-    families: tuple[Family, ...],
+    battery: Battery,
     variance: float,
     signs: np.ndarray,
     residual: np.ndarray | None = None,
 ) -> Ranking:
     """Score all hypotheses against the arranged residuals, or against another vector.
+
+    `variance` is that of unit weight; `signs` [epochs, repetitions] flip whole epochs for the null
+    distribution (`jaxvm.discover.noise.multipliers`).
 
     With another vector e (whitened, like all observations, and orthogonal to the model's
     tangents) the drop is the part of |e|^2 that a hypothesis explains: how much it resembles e.
@@ -128,32 +137,37 @@ def score_residuals(
         own = padded[arrangement.rows].reshape(cells.residual.shape)
         cells = eqx.tree_at(lambda c: c.residual, cells, jnp.asarray(own))
     results, null = [], np.full(signs.shape[1], -np.inf)
-    for family in families:
+    for family, weights, used in zip(battery.families, battery.weights, battery.used, strict=True):
         ports, patterns = _group_arrays(scene, arrangement, family)
-        weights = _course_weights(scene, arrangement, family)
-        n_courses, n_scopes = len(family.courses), len(family.scopes)
-        valid = family.valid.reshape(len(family.groups), n_courses * n_scopes)
-        # Only pairs of course and scope that some group uses are computed.
-        used = np.flatnonzero(valid.any(axis=0))
+        valid = family.valid.reshape(len(family.groups), -1)[:, used]
+        n_groups, n_pairs = valid.shape
+        # Rounded sizes: a driver more or a mark less is no other program.
+        more, wider = rounded(n_groups) - n_groups, rounded(n_pairs) - n_pairs
+        ports, patterns, valid = (_grown(a, more) for a in (ports, patterns, valid))
+        valid = np.pad(valid, [(0, 0), (0, wider)])
         drop, z, amplitude, seen, sound, largest = _kernel(
             cells,
             jnp.asarray(ports),
             jnp.asarray(patterns),
-            jnp.asarray(weights[used]),
-            jnp.asarray(valid[:, used]),
+            jnp.asarray(_grown(weights, wider)),
+            jnp.asarray(valid),
             jnp.asarray(signs),
             jnp.asarray(variance),
         )
         null = np.maximum(null, np.asarray(largest))
-
         drop, z, amplitude, seen, sound = (
-            _spread(np.asarray(values), used, family.valid.shape, fill)
+            _spread(np.asarray(values)[:n_groups, :n_pairs], used, family.valid.shape, fill)
             for values, fill in (
                 (drop, 0.0), (z, -np.inf), (amplitude, 0.0), (seen, 0.0), (sound, False),
             )
         )  # fmt: skip
         results.append(Scores(family, drop, z, amplitude, seen, sound, variance))
     return Ranking(tuple(results), null)
+
+
+def _grown(values: np.ndarray, more: int) -> np.ndarray:
+    """An array with some rows of zeros behind."""
+    return np.concatenate([values, np.zeros((more, *values.shape[1:]), values.dtype)])
 
 
 def _spread(values: np.ndarray, used: np.ndarray, shape: tuple[int, ...], fill) -> np.ndarray:
@@ -193,39 +207,42 @@ def _mark_mask(scene: Scene, arrangement: Arrangement, mark: tuple[int, int]) ->
     return own[arrangement.rows]
 
 
-def _course_weights(scene: Scene, arrangement: Arrangement, family: Family) -> np.ndarray:
-    """Weights [courses * scopes, bases, cells]: the course at the cell's epoch, in scope."""
-    course = course_table(scene, family)[:, :, arrangement.epoch]
-    inside = np.concatenate(
-        [
-            np.stack([in_scope(scene, scope, rows) for rows in scene.tables], axis=0)
-            if len(scene.tables) == 1
-            else np.concatenate([in_scope(scene, scope, rows) for rows in scene.tables])[None]
-            for scope in family.scopes
-        ]
-    )
-    if scene.network.ranges is not None:
-        ranges = np.stack([ranges_in_scope(scene, scope) for scope in family.scopes])
-        inside = np.concatenate([inside, ranges], axis=1)
+def _inside(scene: Scene, arrangement: Arrangement, scopes: tuple[Scope, ...]) -> np.ndarray:
+    """1 where a cell is in a scope [scopes, cells]."""
+    found = []
+    for scope in scopes:
+        own = [in_scope(scene, scope, rows) for rows in scene.tables]
+        if scene.network.ranges is not None:
+            own.append(ranges_in_scope(scene, scope))
+        found.append(np.concatenate(own))
+    inside = np.stack(found)
     first = arrangement.rows.min(axis=1)  # any observation speaks for its cell
-    inside = inside[:, first]
-    weights = course[:, None] * inside[None, :, None]
-    return weights.reshape(-1, family.n_bases, len(first))
+    return inside[:, np.where(first < inside.shape[1], first, 0)]
 
 
-def course_table(scene: Scene, family: Family) -> np.ndarray:
-    """Courses [courses, bases, epochs] of a family, at the epochs."""
+def course_tables(scene: Scene, families: tuple[Family, ...]) -> list[np.ndarray]:
+    """Courses [courses, bases, epochs] of each family, at the epochs."""
     channels = scene.network.channels
-    x, basis, constants = [], [], []
-    for course in family.courses:
-        form = FORMS[course.form]
-        reference = course.reference if form.centred else 0.0
-        for name in form.bases:
-            x.append(np.asarray(channels.values[channels.index(course.driver)]) - reference)
-            basis.append(BASIS_INDEX[name])
-            constants.append((*course.constants, 1.0, 1.0)[:2])
-    table = _evaluate(channels, *(jnp.asarray(v) for v in (basis, x, constants)))
-    return np.asarray(table).reshape(len(family.courses), family.n_bases, -1)
+    place: dict[tuple, int] = {}
+    x, basis, constants, index = [], [], [], []
+    for family in families:
+        own = []
+        for course in family.courses:
+            form = FORMS[course.form]
+            reference = course.reference if form.centred else 0.0
+            for name in form.bases:
+                key = (course.driver, reference, name, course.constants)
+                if key not in place:
+                    place[key] = len(x)
+                    x.append(np.asarray(channels.values[channels.index(course.driver)]) - reference)
+                    basis.append(BASIS_INDEX[name])
+                    constants.append((*course.constants, 1.0, 1.0)[:2])
+                own.append(place[key])
+        index.append(np.array(own).reshape(len(family.courses), family.n_bases))
+    more = rounded(len(x)) - len(x)
+    rows = (_grown(np.array(v), more) for v in (basis, x, constants))
+    table = np.asarray(_evaluate(channels, *map(jnp.asarray, rows)))
+    return [table[own] for own in index]
 
 
 @eqx.filter_jit
@@ -270,7 +287,8 @@ def _kernel(
         square = jnp.einsum("knr,lnr->nkl", tangent, tangent)
         product = jnp.einsum("knr,nr->kn", tangent, residual)
         halves = jnp.einsum("knr,nrs->nks", tangent, cells.half)
-        gram = jnp.einsum("bin,bjn,nkl->bkilj", weights, weights, square)
+        scaled_weights = jnp.einsum("bin,nkl->bkiln", weights, square)
+        gram = jnp.einsum("bkiln,bjn->bkilj", scaled_weights, weights)
         gram = jnp.reshape(gram, (b, columns, columns))
         shared = jnp.einsum("bin,nks->bkis", weights, halves[:, :, d:])
         shared = jnp.reshape(shared, (b, columns, -1))
@@ -346,13 +364,22 @@ def surprise(chi_square: Float[Array, "..."], columns: int) -> Float[Array, "...
 
 
 def top(ranking: Ranking, scene: Scene, count: int) -> list[tuple[Hypothesis, float, np.ndarray]]:
-    """The leading hypotheses by z: (hypothesis, drop, one-step amplitudes)."""
+    """The leading hypotheses by z: (hypothesis, drop, one-step amplitudes).
+
+    Courses that differ only in their constants (instants, lags, periods) count as one: the best.
+    """
     entries = []
     for scores in ranking.scores:
-        flat = np.where(scores.valid, scores.z, -np.inf).ravel()
-        for position in np.argsort(-flat)[:count]:
-            if np.isfinite(flat[position]):
-                entries.append((flat[position], scores, np.unravel_index(position, scores.z.shape)))
+        z = np.where(scores.valid, scores.z, -np.inf)
+        kinds: dict[tuple[str, str], list[int]] = {}
+        for place, course in enumerate(scores.family.courses):
+            kinds.setdefault((course.driver, course.form), []).append(place)
+        for places in kinds.values():
+            own = z[:, places]
+            best = np.argmax(own, axis=1)
+            value = np.max(own, axis=1)
+            for g, s in np.argwhere(np.isfinite(value)):
+                entries.append((value[g, s], scores, (g, places[best[g, s]], s)))
     entries.sort(key=lambda entry: -entry[0])
     return [
         (member(s.family, index, scene), float(s.drop[index]), s.amplitude[index])

@@ -10,10 +10,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from jaxvm.discover.cells import Arrangement
+from jaxvm.discover.heldout import Split
 from jaxvm.discover.hypotheses import Hypothesis
-from jaxvm.discover.score import Ranking, score_residuals, top
+from jaxvm.discover.score import Battery, Ranking, score_residuals, top
 from jaxvm.network.scene import Scene
-from jaxvm.physics.effects import Effect
+from jaxvm.physics.effects import Effect, room_for
 from jaxvm.physics.forms import FORMS
 from jaxvm.solve.adjust import Adjustment, adjust
 
@@ -53,7 +54,15 @@ class Rival:
 
 
 def log_prior(hypothesis: Hypothesis, amplitudes: np.ndarray) -> float:
-    """Log plausibility: named physics of a plausible size is preferred."""
+    """Log plausibility: named physics of a plausible size is preferred.
+
+    Every name shares its prior among the drivers and forms in which it was asked: one of fifty
+    courses that happens to fit a little better is no better than the only constant.
+    """
+    return _plausible(hypothesis, amplitudes) - float(np.log(hypothesis.alternatives))
+
+
+def _plausible(hypothesis: Hypothesis, amplitudes: np.ndarray) -> float:
     if not hypothesis.entries:
         return float(np.log(UNNAMED_PRIOR))
     size = float(np.linalg.norm(amplitudes[:: len(FORMS[hypothesis.course.form].bases)]))
@@ -107,23 +116,21 @@ def shortlist(ranking: Ranking, scene: Scene, variance: float, n: int, count: in
     return chosen
 
 
-def refit(
-    base: Adjustment, hypothesis: Hypothesis, amplitudes, room, weights, range_weights, n: int
-) -> Candidate | None:
+def refit(base: Adjustment, hypothesis: Hypothesis, amplitudes, split: Split) -> Candidate | None:
     """Refit everything with a hypothesis in, nonlinear constants free.
 
-    None where the fit does not converge: what the recording hardly tells from the plain model has
-    no size of its own.
+    A fit that creeps (a free-form curve beside a lens that can nearly do the same) counts with what
+    it has reached. None where it fails.
     """
     # From amplitude zero the first step moves everything together.
     effects = (*base.scene.fitted_effects(), hypothesis.effect(0.0 * amplitudes))
-    scene = base.scene.with_effects(effects, room)
+    scene = base.scene.with_effects(effects, room_for(effects, base.scene.room))
 
     def fit(active=None):
         return adjust(
             scene,
-            weights=weights,
-            range_weights=range_weights,
+            weights=split.weights,
+            range_weights=split.range_weights,
             active=active,
             rtol=_RTOL,
             damping=1e-6,
@@ -137,11 +144,11 @@ def refit(
         # The grid's constants are good enough when a refined one runs away.
         fitted = fit(hypothesis_constants_held(scene))
         effect = fitted.scene.fitted_effects()[-1]
-    if not fitted.converged:
+    if fitted.failed:
         return None
     variance = fitted.variance_factor
     drop = 2.0 * (base.cost - fitted.cost)
-    own = evidence(hypothesis, drop, np.asarray(effect.amplitudes), variance, n)
+    own = evidence(hypothesis, drop, np.asarray(effect.amplitudes), variance, split.n)
     return Candidate(hypothesis, fitted, own)
 
 
@@ -168,10 +175,11 @@ def _sensible(scene: Scene, effect: Effect) -> bool:
 def rivals(
     scene: Scene,
     arrangement: Arrangement,
-    ranking: Ranking,
+    battery: Battery,
     chosen: Candidate,
     before: Adjustment,
     n: int,
+    signs: np.ndarray,
 ) -> tuple[float, list[Rival]]:
     """Hypotheses that the recording can't tell from the chosen one at 20:1.
 
@@ -182,11 +190,10 @@ def rivals(
         The posterior weight of the chosen one, and its rivals with theirs.
     """
     variance = chosen.adjustment.variance_factor
-    change = _stacked(before) - _stacked(chosen.adjustment)
+    change = stacked(before) - stacked(chosen.adjustment)
     full = float(np.sum(change**2)) / variance
-    still = np.zeros((len(scene.recording.time), len(ranking.null)))
-    families = tuple(s.family for s in ranking.scores)
-    alike = score_residuals(scene, arrangement, families, variance, still, residual=change)
+    still = np.zeros_like(signs)
+    alike = score_residuals(scene, arrangement, battery, variance, still, residual=change)
     own_identity = identity(chosen.hypothesis)
     penalty = len(chosen.effect.amplitudes) + len(chosen.effect.constants)
     own_prior = log_prior(chosen.hypothesis, np.asarray(chosen.effect.amplitudes))
@@ -208,7 +215,7 @@ def rivals(
     return float(weights[0]), sorted(kept, key=lambda r: -r.weight)
 
 
-def _stacked(adjustment: Adjustment) -> np.ndarray:
+def stacked(adjustment: Adjustment) -> np.ndarray:
     """Whitened residuals of the tables on which effects act, padded to one width."""
     residuals = adjustment.residuals()
     blocks = [np.asarray(b) for b in residuals.pixels]

@@ -15,7 +15,8 @@ def smallest_visible(
     """Smallest amplitude that would be found at family-wise 5 % with power 80 %, by entry.
 
     sqrt(lambda0 / I) with I the information of one column (MATHEMATICS 1.8); lambda0 from the
-    number of hypotheses. Single-term constant hypotheses only; the most favourable place counts.
+    number of hypotheses. Hypotheses of one column, constant or linear in a driver; the most
+    favourable place counts.
     """
     level = norm.isf(0.025 / max(ranking.n, 1)) + norm.isf(0.2)
     unit = {port.name: port.unit for port in PORTS}

@@ -254,7 +254,8 @@ def predict_range(
     rho = n.(t - o) / (n.d), and 0 where the distance to the mark itself is measured.
     """
     at = circumstances
-    target = mark(aim.point, at.target_centre, at.target_half_size, ports)
+    point = jnp.where(to_plane > 0.5, aim.point.at[2].set(0.0), aim.point)
+    target = mark(point, at.target_centre, at.target_half_size, ports)
     pose = pose_from_vector(aim.world_from_target)
     delay = ports["clock.offset"]
     seen = look(

@@ -6,6 +6,8 @@ import numpy as np
 
 from jaxvm.discover.diagnosis import Diagnosis, Finding
 from jaxvm.discover.select import Rival
+from jaxvm.discover.shape import shape_words
+from jaxvm.physics.catalogue import BY_ID
 from jaxvm.report.words import Parameter, explanation, parameters, separate_by, when
 
 FORMAT = 1
@@ -13,7 +15,7 @@ FORMAT = 1
 
 def document(diagnosis: Diagnosis) -> dict[str, Any]:
     """Content of report.json (DESIGN: format 1); plain numbers and texts only."""
-    return {
+    content = {
         "format": FORMAT,
         "recording": diagnosis.recording.model.name,
         "verdict": diagnosis.verdict,
@@ -32,11 +34,27 @@ def document(diagnosis: Diagnosis) -> dict[str, Any]:
         "n_rejected": diagnosis.n_rejected,
         "heldout_epochs": diagnosis.recording.epoch_ids[diagnosis.held].tolist(),
         "smallest_visible": {
-            name: {"amplitude": _number(value), "unit": unit}
+            name: {"amplitude": value, "unit": unit}
             for name, (value, unit) in sorted(diagnosis.smallest.items())
         },
         "seconds": diagnosis.seconds,
     }
+    return _plain(content)
+
+
+def _plain(content):
+    """Lists, dictionaries and Python's own numbers; JSON has no NaN and no infinity."""
+    if isinstance(content, dict):
+        return {key: _plain(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [_plain(value) for value in content]
+    if isinstance(content, bool | np.bool_):
+        return bool(content)
+    if isinstance(content, int | np.integer):
+        return int(content)
+    if isinstance(content, float | np.floating):
+        return float(content) if np.isfinite(content) else None
+    return content
 
 
 def _finding(finding: Finding) -> dict[str, Any]:
@@ -44,6 +62,7 @@ def _finding(finding: Finding) -> dict[str, Any]:
     return {
         "physics": effect.name,
         "catalogue_id": effect.catalogue_id,
+        "rows": _rows(effect.catalogue_id),
         "named": bool(finding.hypothesis.entries),
         "port": effect.terms[0].port,
         "terms": [{"port": t.port, "pattern": t.driver, "basis": t.basis} for t in effect.terms],
@@ -51,6 +70,7 @@ def _finding(finding: Finding) -> dict[str, Any]:
         "form": effect.form,
         "where": effect.scope.as_dict(),
         "when": when(effect),
+        "shape": shape_words(effect),
         "parameters": _parameters(parameters(effect, finding.stds)),
         "final_parameters": _parameters(parameters(finding.final_effect, finding.final_stds)),
         "share_of_excess": finding.share,
@@ -60,10 +80,21 @@ def _finding(finding: Finding) -> dict[str, Any]:
         "equivalents": [_rival(rival) for rival in finding.rivals],
         "nearly_as_good": [h.effect(()).name for h in finding.doubles],
         "separate_by": separate_by(finding),
+        "advice": [
+            {
+                "plan": advice.plan.key,
+                "words": advice.plan.words,
+                "gaps": [gap for gap in advice.gaps],
+                "odds": min(advice.odds, 1e12),
+                "decides": bool(advice.decides),
+            }
+            for advice in finding.advice
+        ],
+        "shared": finding.sharing.words() if finding.sharing else "",
         "explanation": explanation(finding),
         "heldout_rms_px": {"before": gain.before_px, "after": gain.after_px},
         "heldout_share": {"value": gain.share, "interval_95": list(gain.interval)},
-        "ranking": [{"hypothesis": words, "evidence": _number(e)} for words, e in finding.ranking],
+        "ranking": [{"hypothesis": words, "evidence": e} for words, e in finding.ranking],
     }
 
 
@@ -72,6 +103,7 @@ def _rival(rival: Rival) -> dict[str, Any]:
     return {
         "physics": effect.name,
         "catalogue_id": effect.catalogue_id,
+        "rows": _rows(effect.catalogue_id),
         "port": effect.terms[0].port,
         "driver": effect.driver,
         "form": effect.form,
@@ -80,13 +112,9 @@ def _rival(rival: Rival) -> dict[str, Any]:
     }
 
 
+def _rows(catalogue_id: str) -> list[int]:
+    return list(BY_ID[catalogue_id].rows) if catalogue_id in BY_ID else []
+
+
 def _parameters(values: list[Parameter]) -> list[dict[str, Any]]:
-    return [
-        {"name": p.name, "value": _number(p.value), "std": _number(p.std), "unit": p.unit}
-        for p in values
-    ]
-
-
-def _number(value: float) -> float | None:
-    """JSON has no NaN and no infinity."""
-    return float(value) if np.isfinite(value) else None
+    return [{"name": p.name, "value": p.value, "std": p.std, "unit": p.unit} for p in values]

@@ -8,6 +8,7 @@ from jinja2 import Environment, PackageLoader, select_autoescape
 
 from jaxvm import __version__
 from jaxvm.discover.diagnosis import Diagnosis
+from jaxvm.discover.shape import shape_words
 from jaxvm.network.estimate import estimated_model
 from jaxvm.recording.files import write_files
 from jaxvm.recording.write import model_text
@@ -18,6 +19,7 @@ from jaxvm.report.words import (
     in_pixels,
     mistaken_for,
     nearly_as_good,
+    odds,
     parameters,
     quantity,
     separate_by,
@@ -27,20 +29,21 @@ from jaxvm.report.words import (
 )
 
 
-def write_report(diagnosis: Diagnosis, folder: str | Path) -> Path:
+def write_report(diagnosis: Diagnosis, folder: str | Path, data_only: bool = False) -> Path:
     """Write everything about a diagnosis into a folder; returns the path of report.html.
 
-    Files of an earlier report are replaced, each when its successor is complete.
+    With `data_only` there are report.json (whose path is returned) and model.toml, no page and no
+    figures. Files of an earlier report are replaced, each when its successor is complete.
     """
-    pictures = {f"{name}.png": png(figure) for name, figure in figures(diagnosis).items()}
     files: dict[str, str | bytes] = {
-        **pictures,
         "report.json": json.dumps(document(diagnosis), indent=1, allow_nan=False) + "\n",
         "model.toml": model_text(estimated_model(diagnosis.scene)),
-        "report.html": html(diagnosis, pictures),
     }
+    if not data_only:
+        pictures = {f"{name}.png": png(figure) for name, figure in figures(diagnosis).items()}
+        files |= {**pictures, "report.html": html(diagnosis, pictures)}
     write_files(folder, files)
-    return Path(folder) / "report.html"
+    return Path(folder) / ("report.json" if data_only else "report.html")
 
 
 def html(diagnosis: Diagnosis, pictures: dict[str, bytes]) -> str:
@@ -58,7 +61,9 @@ def html(diagnosis: Diagnosis, pictures: dict[str, bytes]) -> str:
         "mistaken_for": mistaken_for,
         "nearly_as_good": nearly_as_good,
         "parameters": parameters,
+        "odds": odds,
         "quantity": quantity,
+        "shape_words": shape_words,
         "separate_by": separate_by,
         "size": size,
         "when": when,

@@ -1,0 +1,86 @@
+"""Accept a hypothesis: refit the leading ones; the best that improves held-out epochs wins."""
+
+from dataclasses import dataclass
+
+from jaxvm.discover.heldout import Gain, HeldOut, Split, gain
+from jaxvm.discover.hypotheses import Hypothesis
+from jaxvm.discover.select import Candidate, identity, refit
+from jaxvm.solve.adjust import Adjustment
+
+_CANDIDATES = 4
+_NEAR = 30.0
+_TIE = 0.05
+_OPEN = 100.0, 0.02
+
+
+@dataclass(frozen=True)
+class Accepted:
+    """A candidate that passed on the held-out epochs.
+
+    Attributes:
+        chosen: the candidate, refitted.
+        near: others that were refitted and fell behind only a little.
+        heldout: its errors on the held-out epochs.
+        gain: what it improves there.
+    """
+
+    chosen: Candidate
+    near: tuple[Hypothesis, ...]
+    heldout: HeldOut
+    gain: Gain
+
+
+def accept(
+    current: Adjustment, leading, split: Split, heldout: HeldOut, seed: int, hopeless: set
+) -> Accepted | str:
+    """The best candidate that improves the held-out epochs, or the name of the one that failed.
+
+    `hopeless` collects what can't be fitted or does not help there; it is not tried again.
+    """
+    # One tangent foretells a drop to a few percent: only near ties of the leading one need a refit.
+    # Where none of them passes, named physics gets its turn; an unnamed effect must lead.
+    least = leading[0][1] - max(_NEAR, _TIE * abs(leading[0][1]))
+    near = [item for item in leading[:_CANDIDATES] if item[1] >= least]
+    rest = [item for item in leading[len(near) :] if item[0].entries]
+    for some in (near, rest[:_CANDIDATES]):
+        refitted = []
+        for hypothesis, _, amplitudes in some:
+            key = (identity(hypothesis), hypothesis.course)
+            if key in hopeless:
+                continue
+            candidate = refit(current, hypothesis, amplitudes, split)
+            if candidate is None or candidate.evidence <= 0.0:
+                hopeless.add(key)
+            else:
+                refitted.append(candidate)
+        for candidate in sorted(refitted, key=lambda c: -_common_evidence(c, refitted, current)):
+            tried = split.evaluate(candidate.adjustment.scene)
+            proof = gain(heldout, tried, seed)
+            if proof.proven:
+                gap = max(_OPEN[0], _OPEN[1] * abs(candidate.evidence))
+                others = tuple(
+                    c.hypothesis
+                    for c in refitted
+                    if c is not candidate and candidate.evidence - c.evidence < gap
+                )
+                return Accepted(candidate, others, tried, proof)
+            hopeless.add((identity(candidate.hypothesis), candidate.hypothesis.course))
+    return short(leading[0][0])
+
+
+def _common_evidence(candidate: Candidate, all_candidates, current: Adjustment) -> float:
+    """Evidence with one variance for all candidates: the smallest that any of them reaches."""
+    variance = min(c.adjustment.variance_factor for c in all_candidates)
+    own = candidate.adjustment.variance_factor
+    drop = 2.0 * (current.cost - candidate.adjustment.cost)
+    return candidate.evidence + drop * (1.0 / variance - 1.0 / own)
+
+
+def short(hypothesis: Hypothesis) -> str:
+    """A hypothesis in a few words."""
+    effect = hypothesis.effect(())
+    parts = [effect.name]
+    if effect.driver != "constant":
+        parts.append(f"{effect.form} in {effect.driver}")
+    parts.append(effect.scope.words())
+    return " · ".join(parts)

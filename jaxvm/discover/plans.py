@@ -1,0 +1,239 @@
+"""Plans: further recordings that could be made with the same cameras and bodies.
+
+A plan changes what an engineer can change (distance, attitude, motion, temperature, power) in a
+recording that was made, and predicts the images with the fitted model. Nothing is measured here;
+what the plan would decide is computed from its geometry alone.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from jaxvm.network.residual import predict_pixels
+from jaxvm.network.scene import Scene, build
+from jaxvm.recording import Drivers, Recording
+
+
+@dataclass(frozen=True)
+class Plan:
+    """One kind of further recording.
+
+    Attributes:
+        key: stable name.
+        words: what to do, for an engineer.
+        poses: changes the poses [targets, epochs, 6] of the targets that move, seen from a point.
+        recording: changes the circumstances (drivers, velocities, power).
+        moves: whether it needs a target that moves.
+    """
+
+    key: str
+    words: str
+    poses: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray] | None = None
+    recording: Callable[[Recording], Recording] | None = None
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A planned recording as a scene, and the weights of what would be seen."""
+
+    scene: Scene
+    weights: tuple[np.ndarray, ...]
+
+
+def _distance(factor: float):
+    def change(poses, eye, up):
+        moved = poses.copy()
+        moved[:, :, 3:] = eye + factor * (poses[:, :, 3:] - eye)
+        return moved
+
+    return change
+
+
+def _turned(angles: Callable[[int], np.ndarray], axis: str):
+    """Turn targets about the line of sight, or about the upward axis across it."""
+
+    def change(poses, eye, up):
+        moved = poses.copy()
+        for target in range(len(poses)):
+            sight = poses[target, :, 3:] - eye
+            about = sight if axis == "sight" else np.cross(np.cross(sight, up), sight)
+            about = about / np.linalg.norm(about, axis=1, keepdims=True)
+            turn = Rotation.from_rotvec(angles(len(sight))[:, None] * about)
+            moved[target, :, :3] = (turn * Rotation.from_rotvec(poses[target, :, :3])).as_rotvec()
+        return moved
+
+    return change
+
+
+def _swept(poses, eye, up):
+    """Targets sweep over the field in a Lissajous figure, up to 0.35 rad off their places."""
+    moved = poses.copy()
+    n = poses.shape[1]
+    phase = 2.0 * np.pi * np.arange(n) / n
+    for target in range(len(poses)):
+        sight = poses[target, :, 3:] - eye
+        across = np.cross(sight, up)
+        across = across / np.linalg.norm(across, axis=1, keepdims=True)
+        upward = np.cross(across, sight)
+        upward = upward / np.linalg.norm(upward, axis=1, keepdims=True)
+        about = 0.35 * (
+            np.sin(3.0 * phase)[:, None] * upward + np.sin(2.0 * phase)[:, None] * across
+        )
+        moved[target, :, 3:] = eye + Rotation.from_rotvec(about).apply(sight)
+    return moved
+
+
+def _cycle(recording: Recording) -> Recording:
+    """Temperatures go up by twice the span seen and return, within a third of the time."""
+    drivers = recording.drivers
+    assert drivers is not None
+    time = drivers.time
+    share = (time - time[0]) / max(time[-1] - time[0], 1e-9)
+    up = np.clip(np.minimum(share / 0.3, (0.8 - share) / 0.3), 0.0, 1.0)
+    channels = {
+        name: values.mean() + 2.0 * np.ptp(values) * up if _warms(name) else values
+        for name, values in drivers.channels.items()
+    }
+    return replace(recording, drivers=Drivers(time, channels))
+
+
+def _warms(name: str) -> bool:
+    return name.endswith(("_degC", "_K"))
+
+
+def _reversed(recording: Recording) -> Recording:
+    faster = {name: -2.0 * values for name, values in recording.velocities.items()}
+    return replace(recording, velocities=faster)
+
+
+def _restarted(recording: Recording) -> Recording:
+    middle = float(0.5 * (recording.time[0] + recording.time[-1]))
+    cameras = tuple(
+        replace(c, powered_on_s=(*c.powered_on_s, middle)) if c.powered_on_s else c
+        for c in recording.model.cameras
+    )
+    return replace(recording, model=replace(recording.model, cameras=cameras))
+
+
+def _longer(recording: Recording) -> Recording:
+    """The same course of everything at half the speed."""
+
+    def later(time):
+        return recording.time[0] + 2.0 * (time - recording.time[0])
+
+    drivers = recording.drivers
+    if drivers is not None:
+        drivers = replace(drivers, time=later(drivers.time))
+    return replace(recording, time=later(recording.time), drivers=drivers)
+
+
+PLANS: tuple[Plan, ...] = (
+    Plan("nearer", "the moving targets at half the distance", poses=_distance(0.5)),
+    Plan("farther", "the moving targets at 2.5 times the distance", poses=_distance(2.5)),
+    Plan(
+        "roll",
+        "the moving targets rolled by 90 degrees about the line of sight for half of the time",
+        poses=_turned(lambda n: np.where(np.arange(n) < n // 2, 0.0, np.pi / 2), "sight"),
+    ),
+    Plan(
+        "tilt",
+        "the moving targets tilted by 40 degrees to one side and to the other",
+        poses=_turned(lambda n: np.where(np.arange(n) % 2, 0.7, -0.7), "up"),
+    ),
+    Plan("field", "the moving targets swept over the whole image", poses=_swept),
+    Plan("cycle", "a faster cycle of heating and cooling that returns", recording=_cycle),
+    Plan("reverse", "the motion the other way and twice as fast", recording=_reversed),
+    Plan("restart", "the cameras switched off and on again in the middle", recording=_restarted),
+    Plan("longer", "the same for twice as long", recording=_longer),
+)
+"""Further recordings that are weighed, in the order of their cost."""
+
+
+def possible(plan: Plan, recording: Recording) -> bool:
+    """Whether a plan can be made with what a recording has."""
+    if plan.poses is not None:
+        return any(target.motion == "per-epoch" for target in recording.model.targets)
+    if plan.key == "cycle":
+        return recording.drivers is not None and any(map(_warms, recording.drivers.channels))
+    if plan.key == "reverse":
+        return bool(recording.velocities)
+    if plan.key == "restart":
+        return any(camera.powered_on_s for camera in recording.model.cameras)
+    return recording.timed
+
+
+def planned(plan: Plan, scene: Scene) -> Planned:
+    """The scene of a planned recording: the fitted cameras and bodies under other conditions.
+
+    Marks that would leave the image, or come behind the camera, have weight zero.
+    """
+    recording = scene.recording
+    if plan.recording is not None:
+        recording = plan.recording(recording)
+    changed = build(recording, ())
+    state = scene.state
+    if plan.poses is not None:
+        state = _with_poses(plan, scene)
+    blank = changed.state
+    state = eqx.tree_at(
+        lambda s: (s.amplitude, s.constant), state, (blank.amplitude, blank.constant)
+    )
+    changed = replace(changed, state=state)
+    changed = changed.with_effects(scene.fitted_effects(), scene.room)
+    sizes = np.array([c.image_size for c in scene.model.cameras], float)
+    camera = recording.observations.camera
+    weights = []
+    for rows, pixels in zip(
+        changed.tables, predict_pixels(changed.state, changed.network), strict=True
+    ):
+        own = np.asarray(pixels)[: len(rows)]
+        inside = (own > 0.0) & (own < sizes[camera[rows]] - 1.0)
+        weights.append((inside.all(axis=1) & _in_front(changed, rows)).astype(float))
+    return Planned(changed, tuple(weights))
+
+
+def _eye(scene: Scene) -> np.ndarray:
+    """The middle of all cameras in the world (m), at the first epoch."""
+    names = [s.name for s in scene.model.stations]
+    places = []
+    for i, camera in enumerate(scene.model.cameras):
+        row = scene.station_row[names.index(camera.station), 0]
+        carrier = np.array(scene.state.world_from_station[row])
+        mounted = np.array(scene.state.station_from_camera[i])
+        places.append(Rotation.from_rotvec(carrier[:3]).apply(mounted[3:]) + carrier[3:])
+    return np.mean(places, axis=0)
+
+
+def _with_poses(plan: Plan, scene: Scene):
+    assert plan.poses is not None
+    table = np.array(scene.state.world_from_target)
+    moving = [i for i, t in enumerate(scene.model.targets) if t.motion == "per-epoch"]
+    rows = scene.target_row[moving]
+    up = np.asarray(scene.model.up, float)
+    table[rows] = plan.poses(table[rows], _eye(scene), up)
+    return eqx.tree_at(lambda s: s.world_from_target, scene.state, jnp.asarray(table))
+
+
+def _in_front(scene: Scene, rows: np.ndarray) -> np.ndarray:
+    """Whether the marks of observations are in front of their cameras."""
+    obs, state = scene.recording.observations, scene.state
+    names = [s.name for s in scene.model.stations]
+    station = np.array([names.index(c.station) for c in scene.model.cameras])
+    camera, epoch, target = obs.camera[rows], obs.epoch[rows], obs.target[rows]
+    point = np.asarray(state.point)[scene.first_point[target] + obs.point[rows]]
+    for table, row, outward in (
+        (state.world_from_target, scene.target_row[target, epoch], True),
+        (state.world_from_station, scene.station_row[station[camera], epoch], False),
+        (state.station_from_camera, camera, False),
+    ):
+        pose = np.array(table)[row]
+        turn = Rotation.from_rotvec(pose[:, :3])
+        if outward:
+            point = turn.apply(point) + pose[:, 3:]
+        else:
+            point = turn.inv().apply(point - pose[:, 3:])
+    return point[:, 2] > 0.0
