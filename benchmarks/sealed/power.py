@@ -1,0 +1,257 @@
+"""What a sealed recording can show: lambda, gaps to rival names, noise floor.
+
+Computed with the key, from the noise-free change e that an effect makes to the measurements, on the
+plain model fitted to the recording with that change taken away (so that it is the truth about which
+things are linear, and that its residuals are noise alone). With e whitened,
+
+    lambda = |M e|^2 / variance,
+
+M the projector on what the plain model does not absorb, is the drop of chi-square that naming the
+effect perfectly is expected to give. A hypothesis that gives the drop d on e is worse by
+lambda - d: the gap. (MATHEMATICS 1.8.)
+"""
+
+from dataclasses import asdict, dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from names import Facts
+from scipy.spatial.transform import Rotation
+
+from jaxvm.discover.cells import Arrangement, Cells, arrange
+from jaxvm.discover.diagnose import GROSS
+from jaxvm.discover.heldout import Split, hold_out, range_weights_of, split, weights_of
+from jaxvm.discover.hypotheses import enumerate_hypotheses, member
+from jaxvm.discover.score import Battery, Ranking, battery, score_residuals
+from jaxvm.network.residual import whitening
+from jaxvm.network.scene import Scene, build
+from jaxvm.network.start import start
+from jaxvm.recording import Recording
+from jaxvm.solve.adjust import Adjustment, adjust
+from jaxvm.solve.snooping import robust_variance
+
+ROOM = (16, 8)
+"""Columns and constants kept free for effects: the diagnosis' compiled programs are used again."""
+
+ROUNDS = 12
+"""At most so many gross errors of one image are set aside."""
+
+ROLL_DEG = 10.0
+
+Change = tuple[np.ndarray, np.ndarray]
+"""Change of pixels [observations, 2] (px) and of ranges [ranges] (m)."""
+
+
+@dataclass(frozen=True)
+class Power:
+    """What one hidden effect could show.
+
+    Attributes:
+        expected_drop: lambda, with the noise that the recording really has.
+        seen: share of |e|^2 that the plain model does not absorb.
+        rms_px: RMS of e over fitted pixel coordinates.
+        drops: largest drop on e by name (key of the catalogue); "" is for hypotheses without one.
+        evidence: the same of drop - unknowns x ln n: a name with more unknowns pays for them.
+    """
+
+    expected_drop: float
+    seen: float
+    rms_px: float
+    drops: dict[str, float]
+    evidence: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What a recording can show: `effects` in the order of the key.
+
+    Attributes:
+        floor_px: held-out RMS of the plain model when nothing is hidden.
+        variance: of unit weight, of the noise alone.
+    """
+
+    effects: tuple[Power, ...]
+    floor_px: float
+    variance: float
+    facts: Facts
+
+    def as_dict(self) -> dict:
+        """Plain numbers for JSON."""
+        return asdict(self)
+
+
+def without(recording: Recording, pixels: np.ndarray, ranges: np.ndarray) -> Recording:
+    """The recording with a change of its pixels (px) and ranges (m) taken away."""
+    obs, own = recording.observations, recording.ranges
+    parts = {"observations": _with(obs, pixel=obs.pixel - pixels)}
+    if own is not None:
+        parts["ranges"] = _with(own, distance=own.distance - ranges)
+    return _with(recording, **parts)
+
+
+def _with(record, **parts):
+    return type(record)(**(vars(record) | parts))
+
+
+def shown(recording: Recording, change: Change, each: list[Change]) -> Shown:
+    """What a recording can show of its hidden effects.
+
+    Args:
+        recording: as it was recorded.
+        change: of the noise-free measurements by all effects together: pixels [observations, 2]
+            (px) and ranges [ranges] (m).
+        each: the same by each effect alone.
+    """
+    base, parts = plain_fit(without(recording, *change))
+    variance = robust_variance(base)
+    effects: tuple[Power, ...] = ()
+    if each:
+        arrangement = arrange(base)
+        asked = battery(base.scene, arrangement, enumerate_hypotheses(base.scene))
+        effects = tuple(_power(base, arrangement, asked, variance, *own) for own in each)
+    floor = parts.evaluate(base.scene).rms_px
+    return Shown(effects, floor, variance, facts_of(base.scene))
+
+
+def plain_fit(recording: Recording) -> tuple[Adjustment, Split]:
+    """The plain model fitted to the epochs that are not held out, without gross errors.
+
+    A gross error pulls its whole image along, so only the worst of an image goes at a time.
+    """
+    scene = start(build(recording, ())).with_effects(recording.model.effects, ROOM)
+    held = hold_out(scene)
+    parts = split(scene, held, tuple(np.ones(len(rows)) for rows in scene.tables))
+    base = parts.fit(scene)
+    for _ in range(ROUNDS):
+        worst = _worst_of_images(base, parts)
+        if not any(own.any() for own in worst):
+            break
+        sound = tuple(s * ~own for s, own in zip(parts.sound, worst, strict=True))
+        parts = split(scene, held, sound)
+        base = parts.fit(base.scene)
+    return base, parts
+
+
+def _worst_of_images(base: Adjustment, parts: Split) -> tuple[np.ndarray, ...]:
+    """For each pixel table: True for gross errors that are the largest of their image."""
+    scene = base.scene
+    momentary = adjust(
+        scene,
+        weights=weights_of(scene, parts.held, parts.sound),
+        range_weights=range_weights_of(scene, parts.held),
+        active=scene.unknowns.of_one_epoch,
+        check=False,
+    )
+    limit = GROSS * np.sqrt(robust_variance(base))
+    obs = scene.recording.observations
+    image = obs.camera * len(parts.held) + obs.epoch
+    size = np.zeros(len(image))
+    pairs = zip(base.residuals().pixels, momentary.residuals().pixels, strict=True)
+    for rows, (a, b) in zip(scene.tables, pairs, strict=True):
+        size[rows] = np.maximum(np.abs(np.asarray(a)), np.abs(np.asarray(b))).max(axis=1)
+    largest = np.zeros(int(image.max()) + 1)
+    np.maximum.at(largest, image, size)
+    worst = (size > limit) & (size == largest[image])
+    return tuple(worst[rows] for rows in scene.tables)
+
+
+def whitened(base: Adjustment, components: int, pixels, ranges) -> np.ndarray:
+    """A change of pixels (px) and ranges (m) like the residuals: [all observations, components]."""
+    scene, blocks = base.scene, []
+    network = base.problem.network
+    for factor, rows in zip(network.pixels, scene.tables, strict=True):
+        blocks.append(np.asarray(whitening(factor))[: len(rows)] * pixels[rows])
+    if network.ranges is not None:
+        n = network.ranges.n_real
+        blocks.append(np.asarray(whitening(network.ranges))[:n] * ranges[:, None])
+    return np.concatenate([np.pad(b, [(0, 0), (0, components - b.shape[1])]) for b in blocks])
+
+
+def in_cells(arrangement: Arrangement, values: np.ndarray) -> np.ndarray:
+    """A vector [all observations, components] in the shape of the residuals of the cells."""
+    padded = np.concatenate([values, np.zeros((1, arrangement.components))])
+    return padded[arrangement.rows].reshape(arrangement.cells.residual.shape)
+
+
+def projected_square(cells: Cells, e: np.ndarray) -> float:
+    """|M e|^2 = |e|^2 - |(J L^-T)^T e|^2 for a vector in cells."""
+    d = cells.n_local
+    absorbed = jnp.sum(jnp.einsum("nr,nrs->s", e, cells.half[:, :, d:]) ** 2)
+    if d:
+        own = jnp.einsum("nr,nrd->dn", e, cells.half[:, :, :d])
+        absorbed = absorbed + jnp.sum(jnp.sum(cells.by(cells.group, own), axis=2) ** 2)
+    return float(max(np.sum(np.asarray(e) ** 2) - float(absorbed), 0.0))
+
+
+def _power(
+    base: Adjustment, arrangement: Arrangement, asked: Battery, variance: float, pixels, ranges
+) -> Power:
+    scene = base.scene
+    e = whitened(base, arrangement.components, pixels, ranges)
+    full = float(np.sum(e**2))
+    square = projected_square(arrangement.cells, in_cells(arrangement, e))
+    still = np.zeros((len(scene.recording.time), 1))
+    alike = score_residuals(scene, arrangement, asked, variance, still, residual=e)
+    drops, evidence = best_by_name(alike, scene, variance, np.log(np.count_nonzero(e)))
+    return Power(
+        expected_drop=square / variance,
+        seen=square / full if full > 0.0 else 0.0,
+        rms_px=float(np.sqrt(np.mean(np.asarray(pixels) ** 2))) if len(pixels) else 0.0,
+        drops=drops,
+        evidence=evidence,
+    )
+
+
+def best_by_name(
+    ranking: Ranking, scene: Scene, variance: float, price: float
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Largest drop, and largest drop less `price` for each unknown, over hypotheses of each name.
+
+    A hypothesis has the first of its names.
+    """
+    drops: dict[str, float] = {}
+    evidence: dict[str, float] = {}
+    known: dict[tuple, str] = {}
+    for scores in ranking.scores:
+        family = scores.family
+        over_scopes = np.where(scores.valid, scores.drop, 0.0).max(axis=2) / variance
+        for g, group in enumerate(family.groups):
+            for c, course in enumerate(family.courses):
+                key = (group, course.driver, course.form)
+                if key not in known:
+                    entries = member(family, (g, c, 0), scene).entries
+                    known[key] = entries[0].id if entries else ""
+                name, drop = known[key], float(over_scopes[g, c])
+                unknowns = family.n_terms * family.n_bases + len(course.constants)
+                drops[name] = max(drops.get(name, 0.0), drop)
+                evidence[name] = max(evidence.get(name, -np.inf), drop - unknowns * price)
+    return drops, evidence
+
+
+def facts_of(scene: Scene) -> Facts:
+    """What of a fitted scene decides ties and places."""
+    model, time = scene.model, scene.recording.time
+    kinds = ("camera", "station", "target", "rangefinder")
+    bodies = (model.cameras, model.stations, model.targets, model.rangefinders)
+    names = {k: tuple(b.name for b in own) for k, own in zip(kinds, bodies, strict=True)}
+    station_of = {body.name: body.station for body in (*model.cameras, *model.rangefinders)}
+    spacing = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+    return Facts(names, station_of, spacing, float(time[0]), rolled(scene))
+
+
+def rolled(scene: Scene) -> bool:
+    """Whether any target's x axis leaves the rows of any camera's image by over ROLL_DEG."""
+    turn = {
+        name: Rotation.from_rotvec(np.array(getattr(scene.state, name))[:, :3])
+        for name in ("station_from_camera", "world_from_station", "world_from_target")
+    }
+    stations = [s.name for s in scene.model.stations]
+    for c, camera in enumerate(scene.model.cameras):
+        station = turn["world_from_station"][scene.station_row[stations.index(camera.station)]]
+        camera_from_world = (station * turn["station_from_camera"][c]).inv()
+        for rows in scene.target_row:
+            x_axis = (camera_from_world * turn["world_from_target"][rows]).as_matrix()[..., 0]
+            lean = np.abs(np.arctan2(x_axis[..., 1], np.abs(x_axis[..., 0])))
+            if np.degrees(lean).max() > ROLL_DEG:
+                return True
+    return False

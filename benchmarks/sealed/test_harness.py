@@ -1,0 +1,205 @@
+"""The harness itself: the projection, the names, the places, the intervals."""
+
+import json
+
+import jax
+import numpy as np
+import pytest
+from judge import _sizes, claims, covered, judge
+from names import Facts, same_name, same_place
+from power import facts_of, in_cells, plain_fit, projected_square, shown, whitened
+from tally import wilson
+
+from jaxvm.discover.cells import arrange
+from jaxvm.recording import read_recording
+from jaxvm.simulate import simulate_deformation_scene
+from jaxvm.solve.compiling import keep_compiled
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """A small recording, and the change that its hidden slip makes."""
+    keep_compiled()
+    folder = tmp_path_factory.mktemp("small")
+    made = {}
+    for name, hide in (("plain", ()), ("slip", ("mount-slip",))):
+        scene = simulate_deformation_scene(hide, seed=3, size="small")
+        made[name] = read_recording(scene.write(folder / name))
+    plain, slip = made["plain"].observations, made["slip"].observations
+    assert np.array_equal(plain.point, slip.point)  # same seed, same noise, same marks missed
+    # Rounding of the tables leaves 1e-4 px.
+    change = slip.pixel - plain.pixel, np.zeros(len(made["slip"].ranges.distance))
+    return made["slip"], change
+
+
+def test_projection_against_dense(small):
+    recording, change = small
+    base, _ = plain_fit(recording)
+    arrangement = arrange(base)
+    e = whitened(base, arrangement.components, *change)
+    square = projected_square(arrangement.cells, in_cells(arrangement, e))
+
+    problem = base.problem
+    jacobian = jax.jacfwd(lambda x: jax.tree.leaves(problem.residual(x)))(base.x)
+    n_real = [f.n_real for f in problem.network.factors()]
+    dense = np.concatenate(
+        [np.asarray(j)[:n].reshape(-1, problem.n) for j, n in zip(jacobian, n_real, strict=False)]
+    )
+    pixels = 2 * len(recording.observations.epoch)
+    vector = np.zeros(len(dense))
+    vector[:pixels] = e[: pixels // 2].ravel()
+    basis, values, _ = np.linalg.svd(dense, full_matrices=False)
+    basis = basis[:, values > 1e-9 * values[0]]
+    expected = np.sum((vector - basis @ (basis.T @ vector)) ** 2)
+    assert square == pytest.approx(expected, rel=1e-6)
+    assert 0.0 < square < np.sum(e**2)
+
+
+def test_power_names_what_was_hidden(small):
+    recording, change = small
+    found = shown(recording, change, [change])
+    own = found.effects[0]
+    assert own.expected_drop > 50.0
+    # A slip is a hypothesis of the catalogue: it takes all of its own drop.
+    assert own.drops["mount-slip"] == pytest.approx(own.expected_drop, rel=0.02)
+    assert all(drop < 1.001 * own.expected_drop for drop in own.drops.values())
+    assert 0.04 < found.floor_px < 0.06
+    assert facts_of(plain_fit(recording)[0].scene).station_of["left"] == "mast"
+
+
+FACTS = Facts(
+    {"camera": ("l", "r"), "station": ("s",), "target": ("a", "b"), "rangefinder": ("f",)},
+    {"l": "s", "r": "s", "f": "s"},
+    600.0,
+    0.0,
+    False,
+)
+
+
+def test_names():
+    assert same_name({"rows": [59]}, [62], FACTS)
+    assert not same_name({"rows": [25, 76]}, [51, 76], FACTS)  # both lag: no common name
+    assert not same_name({"rows": [4]}, [56], FACTS)  # two targets
+    turn = {"rows": [25], "where": {"camera": ["l"]}}
+    assert not same_name(turn, [11], FACTS)
+    alone = Facts({**FACTS.names, "camera": ("l",)}, FACTS.station_of, 600.0, 0.0, False)
+    assert same_name(turn, [11], alone)
+
+
+@pytest.mark.parametrize(
+    ("true", "claimed", "same"),
+    [
+        ({"camera": ["l"]}, {"camera": ["l"]}, True),
+        ({"camera": ["l"]}, {"camera": ["r"]}, False),
+        ({"camera": ["l", "r"]}, {}, True),
+        ({"camera": ["l"]}, {}, False),
+        ({"rangefinder": ["f"]}, {}, True),
+        ({"station": ["s"]}, {"camera": ["l", "r"]}, True),
+        ({"station": ["s"]}, {"camera": ["l"]}, False),
+        ({"target": ["a"], "point": ["p3"]}, {"target": ["a"], "point": ["p3"]}, True),
+        ({"target": ["a"], "point": ["p3"]}, {"target": ["a"]}, False),
+        ({"target": ["a"]}, {"camera": ["l"]}, False),
+    ],
+)
+def test_places(true, claimed, same):
+    assert same_place({"where": true}, claimed, FACTS) is same
+
+
+def test_wilson():
+    # Newcombe 1998, table I: 81 of 263.
+    assert wilson(81, 263) == pytest.approx((0.2553, 0.3662), abs=1e-4)
+    assert wilson(0, 0) == (0.0, 1.0)
+
+
+HIDDEN = {
+    "effect": "slip",
+    "rows": [29],
+    "outside": False,
+    "where": {"camera": ["l"]},
+    "when": "from",
+    "t0_s": 3000.0,
+    "values": {"mount.turn_y": 1e-4},
+}
+REPORT = {
+    "verdict": "explained",
+    "seconds": 10.0,
+    "plain": {"heldout_rms_px": 0.08},
+    "final": {"heldout_rms_px": 0.05},
+    "findings": [
+        {
+            "catalogue_id": "mount-slip",
+            "physics": "the mount slips",
+            "named": True,
+            "rows": [29],
+            "where": {"camera": ["l"]},
+            "form": "step",
+            "weight": 0.99,
+            "parameters": [
+                {"name": "mount.turn_y", "port": "mount.turn_y", "value": 1.1e-4, "std": 1e-5},
+                {"name": "instant", "value": 3300.0, "std": 0.0, "unit": "s"},
+            ],
+            "equivalents": [],
+        }
+    ],
+}
+SHOWN = {
+    "effects": [
+        {
+            "expected_drop": 400.0,
+            "seen": 0.5,
+            "rms_px": 0.1,
+            "drops": {"mount-slip": 399.0},
+            "evidence": {"mount-slip": 390.0},
+        }
+    ],
+    "floor_px": 0.05,
+    "variance": 1.0,
+    "facts": vars(FACTS),
+}
+
+ENTRY = {"id": "r0000", "kind": "one", "hidden": [HIDDEN]}
+ROWS = {"mount-slip": (29,)}
+
+
+def test_judge():
+    row = judge(ENTRY, REPORT, SHOWN, ROWS.get)
+    effect = row["effects"][0]
+    assert effect["in_set"] and effect["first"] and effect["place_right"]
+    assert effect["decidable"] and effect["reason"] == ""
+    assert effect["z"] == [pytest.approx(1.0)]
+    assert row["floor_ratio"] == pytest.approx(1.0)
+    late = json.loads(json.dumps(REPORT))
+    late["findings"][0]["parameters"][1]["value"] = 4000.0
+    row = judge(ENTRY, late, SHOWN, ROWS.get)
+    assert not row["effects"][0]["place_right"]
+    assert "wrong instant" in row["effects"][0]["reason"]
+    empty = judge({"id": "r0001", "kind": "nothing", "hidden": []}, REPORT, SHOWN | {"effects": []})
+    assert empty["false_claim"]
+
+
+def test_claims_and_intervals():
+    finding = dict(REPORT["findings"][0], equivalents=[{"rows": [51], "where": {}, "weight": 0.01}])
+    assert [claim["rows"] for claim in claims(finding)] == [[29], [51]]
+    assert covered(1.0) and not covered(-2.0)
+
+
+def test_sizes_of_vectors_and_waves():
+    def deviation(port, true, parameters, where=None):
+        finding = {"rows": [32], "where": where or {}, "parameters": parameters}
+        own = {"rows": [32], "driver": "", "values": {port: true}}
+        return _sizes(own, finding, FACTS)["z"]
+
+    wave = [
+        {"name": "mount.turn_x, sine", "port": "mount.turn_x", "value": 3.0, "std": 0.1},
+        {"name": "mount.turn_x, cosine", "port": "mount.turn_x", "value": 4.0, "std": 0.1},
+    ]
+    assert deviation("mount.turn_x", -4.9, wave) == [pytest.approx(1.0)]
+    mark = [
+        {"name": f"target.point_{a}", "port": f"target.point_{a}", "value": v, "std": 0.1}
+        for a, v in (("x", 0.0), ("y", 1.0))
+    ]
+    assert deviation("target.point", 0.9, mark) == [pytest.approx(1.0)]
+    turn = [{"name": "station.turn_z", "port": "station.turn_z", "value": 1.0, "std": 0.5}]
+    assert deviation("mount.turn_z", 2.0, turn, {"station": ["s"]}) == [pytest.approx(-2.0)]
+    lags = [{**wave[0], "name": "mount.turn_x, lag"}, {**wave[1], "name": "mount.turn_x, slow lag"}]
+    assert deviation("mount.turn_x", 1.0, lags) == []
