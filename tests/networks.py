@@ -52,6 +52,9 @@ def at_values(scene: Scene, values: dict[str, np.ndarray]) -> Scene:
     """The scene with some fields of its state replaced."""
     state = {name: getattr(scene.state, name) for name in State.__dataclass_fields__}
     for name, value in values.items():
+        if name == "point":
+            # The table has spare rows.
+            value = np.concatenate([value, np.asarray(state[name])[len(value) :]])
         assert state[name].shape == np.shape(value), name
         state[name] = np.asarray(value, float)
     return scene.with_state(State(**{name: np.asarray(v) for name, v in state.items()}))

@@ -39,6 +39,9 @@ def test_truth_within_standard_deviations(name):
             np.asarray(getattr(sd, field)),
         )
         free = sigma > 0
+        if field == "point":
+            # Rows behind the last mark are spare.
+            found, sigma, free = found[: len(true)], sigma[: len(true)], free[: len(true)]
         scores.append(((found - true)[free] / sigma[free]).ravel())
         # What has no standard deviation is held, and has not moved by a single bit.
         assert np.array_equal(found[~free], np.asarray(true)[~free])

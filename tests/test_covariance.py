@@ -71,7 +71,8 @@ def sample(exact):
 def test_noise_free_network_ends_at_the_truth(exact):
     known, result = exact
     assert result.cost < 1e-12
-    assert np.allclose(result.scene.state.point, known.truth["point"], atol=1e-10)
+    points = known.truth["point"]
+    assert np.allclose(result.scene.state.point[: len(points)], points, atol=1e-10)
 
 
 def test_standard_deviations_are_those_of_repetitions(exact, sample):

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.interpolate import BSpline
 
 from jaxvm.physics.drivers import build_channels
 from jaxvm.physics.effects import Effect, Scope, Term, capacity, courses, tabulate
@@ -12,6 +13,7 @@ from jaxvm.physics.forms import (
     BASES,
     BASIS_INDEX,
     FORMS,
+    N_KNOTS,
     bump,
     evaluate_basis,
     first_order_lag,
@@ -175,6 +177,12 @@ def test_bumps_sum_to_one_and_so_do_their_moments():
     )
 
 
+def spline_about(centre, spacing, x):
+    """The cubic B-spline of a regular grid, by SciPy."""
+    knots = centre + spacing * np.arange(-2, 3)
+    return np.nan_to_num(BSpline.basis_element(knots, extrapolate=False)(x))
+
+
 X = np.array([-3.0, -0.5, 0.0, 0.7, 2.0, 4.0])
 T = np.array([0.0, 600.0, 1800.0, 2400.0, 3600.0, 7200.0])
 EXPECTED = {  # with the constants 2 and 0.5, written without the package
@@ -194,6 +202,7 @@ EXPECTED = {  # with the constants 2 and 0.5, written without the package
     "rate": np.gradient(X, T / 3600.0),
     "play": np.array([-3, -2.5, -2, -1.3, 0, 2]) - X,
     "bump": np.array([0, 0, 0, 0, 2 / 3, 0]),  # about 2, knots 0.5 apart
+    **{f"knot {k}": spline_about(2.0 + 0.5 * k, 0.5, X) for k in range(N_KNOTS)},
 }
 
 
@@ -266,7 +275,9 @@ GRID = irregular_times(60, 7000.0, seed=7)
 EPOCHS = np.linspace(100.0, 6900.0, 23)
 CELSIUS = 20.0 + 3.0 * np.sin(GRID / 1500.0)
 WIND = np.random.default_rng(8).normal(size=len(GRID))
-CHANNELS = build_channels(EPOCHS, {"body": CELSIUS, "wind": WIND}, GRID, power_on={"left": -400.0})
+CHANNELS = build_channels(
+    EPOCHS, {"body": CELSIUS, "wind": WIND}, GRID, power_on={"left": (-400.0,)}
+)
 
 WARMING = Effect(
     name="body warms",

@@ -21,7 +21,7 @@ CLOSED_FORMS = {
 }
 """Weight of a residual of e standard deviations."""
 
-THRESHOLDS = {HuberLoss: 2.0, TukeyLoss: 6.0}
+THRESHOLDS = {HuberLoss: 2.0, CauchyLoss: 2.0, TukeyLoss: 6.0}
 
 SIZES = np.array([0.0, 1e-3, 0.3, 0.999, 1.001, 2.0, 2.5, 5.9, 6.1, 40.0])
 
@@ -84,7 +84,7 @@ def test_least_squares_is_spoiled(spoiled):
     assert result.variance_factor > 30
 
 
-@pytest.mark.parametrize("kind", [HuberLoss, TukeyLoss])
+@pytest.mark.parametrize("kind", [HuberLoss, CauchyLoss, TukeyLoss])
 def test_robust_adjustment_resists(spoiled, kind):
     known, recording, wrong = spoiled
     loss = kind(jnp.asarray(THRESHOLDS[kind]))

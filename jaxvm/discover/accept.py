@@ -2,12 +2,15 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from jaxvm.discover.heldout import Gain, HeldOut, Split, gain
 from jaxvm.discover.hypotheses import Hypothesis
 from jaxvm.discover.select import Candidate, identity, refit
 from jaxvm.solve.adjust import Adjustment
 
 _CANDIDATES = 4
+_WIDE = 8
 _NEAR = 30.0
 _TIE = 0.05
 _OPEN = 100.0, 0.02
@@ -43,10 +46,12 @@ def accept(
     near = [item for item in leading[:_CANDIDATES] if item[1] >= least]
     rest = [item for item in leading[len(near) :] if item[0].entries]
     for some in (near, rest[:_CANDIDATES]):
-        refitted = []
-        for hypothesis, _, amplitudes in some:
+        refitted: list[Candidate] = []
+        # Free forms come last: what a name explains as well needs no wide fit.
+        for hypothesis, foretold, amplitudes in sorted(some, key=lambda item: len(item[2]) > _WIDE):
             key = (identity(hypothesis), hypothesis.course)
-            if key in hopeless:
+            best = max((c.evidence for c in refitted), default=-np.inf)
+            if key in hopeless or (len(amplitudes) > _WIDE and foretold < best):
                 continue
             candidate = refit(current, hypothesis, amplitudes, split)
             if candidate is None or candidate.evidence <= 0.0:

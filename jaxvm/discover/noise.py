@@ -76,7 +76,11 @@ def _series(label, epoch, residual, n_epochs: int) -> np.ndarray:
 
 
 def _autocorrelation(series: np.ndarray, distance: int) -> float:
-    """Pooled autocorrelation; the bias of series without their mean, -1/n, is added back."""
+    """Pooled autocorrelation; what a series loses with its own mean is added back.
+
+    Without its mean a series of n epochs is biased by -1/n, and by (1 + r) / (1 - r) times that
+    where neighbours are correlated by r.
+    """
     if not len(series):
         return 0.0
     product = series[:, distance:] * series[:, :-distance]
@@ -86,5 +90,8 @@ def _autocorrelation(series: np.ndarray, distance: int) -> float:
     variance = np.nanmean(series**2)
     length = np.isfinite(series[:, :, 0]).sum(axis=1).mean()
     deviation = 1.0 / np.sqrt(pairs.sum())
-    value = float(np.nanmean(product) / max(variance, 1e-300) + 1.0 / length)
+    raw = float(np.nanmean(product) / max(variance, 1e-300))
+    near = float(np.nanmean(series[:, 1:] * series[:, :-1]) / max(variance, 1e-300))
+    near = min(max(near + 1.0 / length, 0.0), 0.9)
+    value = raw + (1.0 + near) / (1.0 - near) / length
     return value if value > 3.0 * deviation else 0.0

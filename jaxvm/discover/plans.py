@@ -25,14 +25,14 @@ class Plan:
     Attributes:
         key: stable name.
         words: what to do, for an engineer.
-        poses: changes the poses [targets, epochs, 6] of the targets that move, seen from a point.
+        poses: changes the poses [targets, epochs, 6] of the targets that move, from the middles of
+            their marks (target coordinates), the eye that sees them and the upward direction.
         recording: changes the circumstances (drivers, velocities, power).
-        moves: whether it needs a target that moves.
     """
 
     key: str
     words: str
-    poses: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray] | None = None
+    poses: Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray] | None = None
     recording: Callable[[Recording], Recording] | None = None
 
 
@@ -45,7 +45,7 @@ class Planned:
 
 
 def _distance(factor: float):
-    def change(poses, eye, up):
+    def change(poses, middles, eye, up):
         moved = poses.copy()
         moved[:, :, 3:] = eye + factor * (poses[:, :, 3:] - eye)
         return moved
@@ -56,30 +56,45 @@ def _distance(factor: float):
 def _turned(angles: Callable[[int], np.ndarray], axis: str):
     """Turn targets about the line of sight, or about the upward axis across it."""
 
-    def change(poses, eye, up):
+    def change(poses, middles, eye, up):
         moved = poses.copy()
         for target in range(len(poses)):
-            sight = poses[target, :, 3:] - eye
-            about = sight if axis == "sight" else np.cross(np.cross(sight, up), sight)
-            about = about / np.linalg.norm(about, axis=1, keepdims=True)
-            turn = Rotation.from_rotvec(angles(len(sight))[:, None] * about)
-            moved[target, :, :3] = (turn * Rotation.from_rotvec(poses[target, :, :3])).as_rotvec()
+            before = Rotation.from_rotvec(poses[target, :, :3])
+            middle = before.apply(middles[target]) + poses[target, :, 3:]
+            sight = middle - eye
+            about = _unit(sight) if axis == "sight" else _across(sight, up)[1]
+            turned = Rotation.from_rotvec(angles(len(sight))[:, None] * about) * before
+            moved[target, :, :3] = turned.as_rotvec()
+            moved[target, :, 3:] = middle - turned.apply(middles[target])
         return moved
 
     return change
 
 
-def _swept(poses, eye, up):
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def _across(sight: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit vectors to the side of lines of sight and upward across them.
+
+    For a sight along `up` any side will do.
+    """
+    steep = np.abs(_unit(sight) @ up) > 0.99
+    other = np.roll(up, 1) if abs(up @ np.roll(up, 1)) < 0.9 else np.array([1.0, 0.0, 0.0])
+    reference = np.where(steep[:, None], other, up)
+    side = _unit(np.cross(sight, reference))
+    return side, _unit(np.cross(side, sight))
+
+
+def _swept(poses, middles, eye, up):
     """Targets sweep over the field in a Lissajous figure, up to 0.35 rad off their places."""
     moved = poses.copy()
     n = poses.shape[1]
     phase = 2.0 * np.pi * np.arange(n) / n
     for target in range(len(poses)):
         sight = poses[target, :, 3:] - eye
-        across = np.cross(sight, up)
-        across = across / np.linalg.norm(across, axis=1, keepdims=True)
-        upward = np.cross(across, sight)
-        upward = upward / np.linalg.norm(upward, axis=1, keepdims=True)
+        across, upward = _across(sight, up)
         about = 0.35 * (
             np.sin(3.0 * phase)[:, None] * upward + np.sin(2.0 * phase)[:, None] * across
         )
@@ -214,7 +229,9 @@ def _with_poses(plan: Plan, scene: Scene):
     moving = [i for i, t in enumerate(scene.model.targets) if t.motion == "per-epoch"]
     rows = scene.target_row[moving]
     up = np.asarray(scene.model.up, float)
-    table[rows] = plan.poses(table[rows], _eye(scene), up)
+    middles = [scene.model.targets[i].points for i in moving]
+    middles = np.array([0.5 * (p.min(axis=0) + p.max(axis=0)) for p in middles])
+    table[rows] = plan.poses(table[rows], middles, _eye(scene), up)
     return eqx.tree_at(lambda s: s.world_from_target, scene.state, jnp.asarray(table))
 
 

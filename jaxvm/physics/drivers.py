@@ -216,6 +216,13 @@ def build_channels(
     several sessions (`starts`, s), the time since the start of each is a channel, too.
     """
     grid = epoch_time if recorded_time is None else recorded_time
+    moments = {name: np.asarray(own, float) for name, own in power_on.items()}
+    sessions = np.zeros(1) if starts is None else np.asarray(starts, float)
+    if len(sessions) > 1 or any(len(own) > 1 for own in moments.values()):
+        # Clocks that start anew jump; the epochs have to be on the grid to read them rightly.
+        finer = np.unique(np.round(np.concatenate([grid, epoch_time]), 6))
+        recorded = {name: np.interp(finer, grid, values) for name, values in recorded.items()}
+        grid = finer
     if len(grid) == 1:
         # Forms with a memory need two samples; nothing changes between them.
         grid = grid[0] + np.array([0.0, 1.0])
@@ -225,11 +232,11 @@ def build_channels(
     if len(epoch_time) > 1:
         name = "time" if timed else "order"
         rows[name] = (name, grid - epoch_time[0])
-    if timed and starts is not None and len(starts) > 1:
-        rows["time since the session's start"] = ("time", _since(grid, starts))
+    if timed and len(sessions) > 1:
+        rows["time since the session's start"] = ("time", _since(grid, sessions))
     rows |= {
-        f"time since power-on of {camera}": ("power-on", _since(grid, np.asarray(moments)))
-        for camera, moments in power_on.items()
+        f"time since power-on of {camera}": ("power-on", _since(grid, own))
+        for camera, own in moments.items()
     }
     return Channels(
         time=jnp.asarray(grid, float),

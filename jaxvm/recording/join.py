@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from jaxvm.recording.model import Model
-from jaxvm.recording.recording import Drivers, Observations, Ranges, Recording
+from jaxvm.recording.recording import Drivers, Links, Observations, Ranges, Recording
 
 PAUSE_S = 86_400.0
 """Pause (s) between two recordings whose clocks overlap: long enough for lags to settle."""
@@ -16,7 +16,8 @@ def join(first: Recording, second: Recording) -> Recording:
 
     Cameras, rangefinders and bodies of one name are the same; what is static stayed where it was,
     what moves per epoch goes on. The second recording keeps its clock where that is later, and
-    follows after a pause otherwise. Of the drivers, those that both have are kept.
+    follows after a pause otherwise. Of the drivers, those that both have are kept; a link that both
+    have counts once. That there were two sessions is not kept in a file.
 
     Raises:
         ValueError: the recordings have other cameras, stations, targets, marks or rangefinders.
@@ -29,7 +30,10 @@ def join(first: Recording, second: Recording) -> Recording:
         begins = min(begins, second.drivers.time[0])
     later = 0.0 if begins > ends else ends + PAUSE_S - begins
     cameras = tuple(
-        replace(a, powered_on_s=(*a.powered_on_s, *(m + later for m in b.powered_on_s)))
+        replace(
+            a,
+            powered_on_s=tuple(sorted({*a.powered_on_s, *(m + later for m in b.powered_on_s)})),
+        )
         for a, b in zip(model.cameras, second.model.cameras, strict=True)
     )
     velocities = {
@@ -46,7 +50,7 @@ def join(first: Recording, second: Recording) -> Recording:
         observations=_stacked(Observations, first.observations, second.observations, n),
         drivers=_drivers(first, second, later),
         ranges=_stacked(Ranges, first.ranges, second.ranges, n),
-        links=first.links,
+        links=_links(first.links, second.links, n),
         timed=first.timed and second.timed,
         starts=(*first.starts, *(n + start for start in second.starts)),
     )
@@ -80,6 +84,26 @@ def _stacked(kind, first, second, epochs: int):
     parts = {name: np.concatenate([getattr(first, name), getattr(second, name)])
              for name in vars(first)}  # fmt: skip
     return kind(**parts)
+
+
+def _links(first: Links | None, second: Links | None, epochs: int) -> Links | None:
+    if first is None or second is None:
+        return first if second is None else _later(second, epochs)
+    new = [k for k, name in enumerate(second.name) if name not in first.name]
+    more = _later(second, epochs)
+    return Links(
+        name=(*first.name, *(more.name[k] for k in new)),
+        from_node=[*first.from_node, *(more.from_node[k] for k in new)],
+        to_node=[*first.to_node, *(more.to_node[k] for k in new)],
+        pose=np.concatenate([first.pose, more.pose[new]]),
+        sigma_rad=np.concatenate([first.sigma_rad, more.sigma_rad[new]]),
+        sigma_m=np.concatenate([first.sigma_m, more.sigma_m[new]]),
+        epoch=np.concatenate([first.epoch, more.epoch[new]]),
+    )
+
+
+def _later(links: Links, epochs: int) -> Links:
+    return replace(links, epoch=np.where(links.epoch < 0, -1, links.epoch + epochs))
 
 
 def _drivers(first: Recording, second: Recording, later: float) -> Drivers | None:

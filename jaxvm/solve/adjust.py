@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
-from jaxvm.network.residual import Residuals
+from jaxvm.network.residual import Residuals, residual
 from jaxvm.network.scene import Scene
 from jaxvm.solve.compiling import compile_seconds
 from jaxvm.solve.gauge import check_gauge
-from jaxvm.solve.optimise import METHODS
+from jaxvm.solve.optimise import METHODS, minimise
 from jaxvm.solve.problem import Normal, Problem, normal_at, scaled, scene_problem
 from jaxvm.solve.robust import Loss
 
@@ -64,7 +64,7 @@ class Adjustment:
 
     def residuals(self) -> Residuals:
         """Whitened residuals at the solution, without the padding of the tables."""
-        padded = _residuals(self.problem, self.x)
+        padded = residual(_state(self.problem, self.x), self.problem.network)
         pixels = tuple(
             block[: len(rows)] for block, rows in zip(padded.pixels, self.scene.tables, strict=True)
         )
@@ -135,13 +135,11 @@ def adjust(
     solver = METHODS[method](
         jnp.asarray(rtol), limit=jnp.asarray(max_steps), damping=jnp.asarray(damping)
     )
-    solution = _minimise(problem, solver)
-    x = solution.value
-    stats = solution.stats
-    history = np.asarray(stats["history"])
+    x, last = minimise(problem, normal, solver)
+    history = np.asarray(last.history)
     history = history[~np.isnan(history)]
     state = _state(problem, x)
-    why = _why(solution, stats, max_steps)
+    why = _why(last, max_steps)
     return Adjustment(
         scene=scene.with_state(state),
         problem=problem,
@@ -149,8 +147,8 @@ def adjust(
         cost_before=float(history[0]) if len(history) else float("nan"),
         cost=float(history[-1]) if len(history) else float("nan"),
         degrees_of_freedom=degrees_of_freedom(problem, normal),
-        evaluations=int(stats["evaluations"]),
-        accepted=int(stats["accepted"]),
+        evaluations=int(last.evaluations),
+        accepted=int(last.accepted),
         history=history,
         why=why,
         seconds=time.perf_counter() - began,
@@ -175,31 +173,14 @@ def degrees_of_freedom(problem: Problem, normal: Normal) -> int:
 
 
 @eqx.filter_jit
-def _minimise(problem: Problem, solver):
-    return optx.least_squares(
-        lambda x, p: p.residual(x),
-        solver,
-        jnp.zeros(problem.n),
-        args=problem,
-        max_steps=None,
-        throw=False,
-    )
-
-
-@eqx.filter_jit
 def _state(problem: Problem, x):
     return problem.state(x)
 
 
-@eqx.filter_jit
-def _residuals(problem: Problem, x):
-    return problem.residual(x)
-
-
-def _why(solution, stats, max_steps) -> str:
-    if int(stats["evaluations"]) >= max_steps:
+def _why(last, max_steps) -> str:
+    if int(last.evaluations) >= max_steps:
         return f"stopped after {max_steps} evaluations: not converged"
-    if solution.result == optx.RESULTS.successful:
+    if last.result == optx.RESULTS.successful:
         return "converged: the cost no longer changes"
     return "failed: the normal equations are singular"
 

@@ -15,7 +15,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxvm.solve.arrow import ArrowCholesky
-from jaxvm.solve.problem import normal_at
+from jaxvm.solve.problem import Normal, Problem, normal_at
 
 _HISTORY = 512
 
@@ -68,11 +68,13 @@ class NormalEquationSolver(optx.AbstractLeastSquaresSolver):
     search: optx.AbstractSearch
 
     def _info(self, y, problem):
-        normal = normal_at(problem, y)
-        return optx.FunctionInfo.EvalGradHessian(normal.cost, normal.gradient, normal.hessian)
+        return _as_info(normal_at(problem, y))
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
-        shape = eqx.filter_eval_shape(self._info, y, args)
+        return self.begin(y, eqx.filter_eval_shape(self._info, y, args))
+
+    def begin(self, y, shape):
+        """State before the first step; `shape` is the structure of the normal equations."""
         blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape)
         return _State(
             first=jnp.array(True),
@@ -88,7 +90,10 @@ class NormalEquationSolver(optx.AbstractLeastSquaresSolver):
         )
 
     def step(self, fn, y, args, options, state, tags):
-        info = self._info(state.trial, args)
+        return *self.advance(y, state, self._info(state.trial, args)), None
+
+    def advance(self, y, state, info):
+        """Accept or reject the trial point by its normal equations, and propose the next one."""
         size, accept, search_result, search = self.search.step(
             state.first, y, state.trial, state.info, info, state.search
         )
@@ -121,7 +126,7 @@ class NormalEquationSolver(optx.AbstractLeastSquaresSolver):
             accepted=state.accepted + accept,
             history=state.history.at[state.evaluations].set(kept.f, mode="drop"),
         )
-        return y, state, None
+        return y, state
 
     def terminate(self, fn, y, args, options, state, tags):
         return state.done, state.result
@@ -132,6 +137,38 @@ class NormalEquationSolver(optx.AbstractLeastSquaresSolver):
             "accepted": state.accepted,
             "history": state.history,
         }  # fmt: skip
+
+
+def minimise(problem: Problem, normal: Normal, solver: NormalEquationSolver):
+    """Drive a solver from x = 0, where the normal equations are known already.
+
+    The same as `optimistix.least_squares`, step by step from outside, so that the one compiled
+    program for the normal equations serves here, too; compiling is what most calls wait for.
+
+    Returns:
+        The solution x, the solver's last state.
+    """
+    info = _as_info(normal)
+    y, state = _begin(solver, info)
+    y, state = _advance(solver, y, state, info)
+    while not bool(state.done):
+        y, state = _advance(solver, y, state, _as_info(normal_at(problem, state.trial)))
+    return y, state
+
+
+def _as_info(normal: Normal):
+    return optx.FunctionInfo.EvalGradHessian(normal.cost, normal.gradient, normal.hessian)
+
+
+@eqx.filter_jit
+def _begin(solver: NormalEquationSolver, info):
+    y = jnp.zeros_like(info.grad)
+    return y, solver.begin(y, info)
+
+
+@eqx.filter_jit
+def _advance(solver: NormalEquationSolver, y, state, info):
+    return solver.advance(y, state, info)
 
 
 def gauss_newton(

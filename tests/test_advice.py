@@ -1,0 +1,378 @@
+"""What to record next: information against a dense matrix, gaps against closed forms and refits."""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from networks import HELD, IMAGE, at_values, stereo_recording
+from scipy.spatial.transform import Rotation
+
+from jaxvm.discover.advice import _information, advise
+from jaxvm.discover.hypotheses import Course, Group, Hypothesis
+from jaxvm.discover.plans import PLANS, Plan, planned, possible
+from jaxvm.geometry.targets import grid_points
+from jaxvm.network.residual import predict_pixels
+from jaxvm.network.scene import Scene, build
+from jaxvm.physics.effects import Scope, Term
+from jaxvm.recording import (
+    Camera,
+    Drivers,
+    Model,
+    Observations,
+    Recording,
+    Station,
+    Target,
+    join,
+)
+from jaxvm.recording.model import grid_names
+from jaxvm.solve.adjust import adjust, with_weights
+from jaxvm.solve.problem import scene_problem
+
+PLAN = {plan.key: plan for plan in PLANS}
+ROOM = (4, 4)
+
+
+def rival(port: str, driver: str, form: str, reference: float = 0.0) -> Hypothesis:
+    """One port of the left camera."""
+    course = Course(driver, form, (), reference)
+    return Hypothesis(Group((Term(port),), "camera"), course, Scope(camera=("left",)), ())
+
+
+def predicted(scene: Scene) -> np.ndarray:
+    """Pixels in the order of the recording."""
+    pixel = np.zeros(scene.recording.observations.pixel.shape)
+    for rows, own in zip(scene.tables, predict_pixels(scene.state, scene.network), strict=True):
+        pixel[rows] = np.asarray(own)[: len(rows)]
+    return pixel
+
+
+def with_pixels(scene: Scene, used: np.ndarray | None = None) -> Recording:
+    """The recording of a scene with the pixels that the scene predicts, of the used rows."""
+    obs = replace(scene.recording.observations, pixel=predicted(scene))
+    if used is not None:
+        obs = Observations(**{name: values[used] for name, values in vars(obs).items()})
+    return replace(scene.recording, observations=obs)
+
+
+# --- two cameras, a reference and a plate that moves ----------------------------------------------
+
+AMPLITUDE = 1e-3
+FOCAL = rival("sensor.focal", "body_degC", "linear", 20.0)
+SHIFT = rival("mount.shift_z", "body_degC", "linear", 20.0)
+
+
+@pytest.fixture(scope="module")
+def stereo() -> Scene:
+    """A scene at the truth, its left principal distance growing with a temperature, no noise."""
+    known = stereo_recording(with_ranges=False, noise=0.0)
+    time = known.recording.time
+    drivers = Drivers(time, {"body_degC": 20.0 + np.array([0.0, 2.0, 3.0, -1.0, -3.0, -1.0])})
+    plate = np.random.default_rng(3).standard_normal((len(time), 6))
+    recording = replace(known.recording, drivers=drivers, velocities={"plate": plate})
+    effects = (FOCAL.effect((AMPLITUDE,)),)
+    scene = at_values(build(recording), known.truth).with_effects(effects, ROOM)
+    return at_pixels(scene, with_pixels(scene))
+
+
+def at_pixels(scene: Scene, recording: Recording) -> Scene:
+    """The same values for other measured pixels."""
+    new = build(recording).with_effects(scene.fitted_effects(), scene.room)
+    return new.with_state(scene.state)
+
+
+def ones(scene: Scene) -> tuple[np.ndarray, ...]:
+    return tuple(np.ones(len(rows)) for rows in scene.tables)
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_information_is_a_dense_schur_complement(stereo, weighted):
+    """With momentary poses eliminated by numpy from the Jacobian of all residuals."""
+    weights = ones(stereo)
+    if weighted:
+        weights = tuple((np.arange(len(w)) % 4 > 0).astype(float) for w in weights)
+    problem = with_weights(scene_problem(stereo), weights)
+    jacobian = np.asarray(dense_jacobian(problem, jnp.zeros(problem.n)))
+    dense = jacobian.T @ jacobian
+    s = problem.sizes[0]
+    assert 0 < s < problem.n
+    cross = dense[s:, :s]
+    local = np.diag(dense)[s:] > 0
+    solved = np.linalg.solve(dense[s:, s:][np.ix_(local, local)], cross[local])
+    expected = dense[:s, :s] - cross[local].T @ solved
+    got = _information(stereo, weights)
+    assert got.shape == (s, s)
+    scale = np.sqrt(np.diag(dense)[:s])
+    scale = np.where(scale > 0.0, scale, 1.0)
+    assert np.abs((got - expected) / np.outer(scale, scale)).max() < 1e-7
+    # The elimination is no small correction.
+    assert np.abs((dense[:s, :s] - expected) / np.outer(scale, scale)).max() > 1e-2
+
+
+@eqx.filter_jit
+def dense_jacobian(problem, x):
+    return jax.jacfwd(
+        lambda y: jnp.concatenate([jnp.ravel(r) for r in jax.tree.leaves(problem.residual(y))])
+    )(x)
+
+
+def test_the_predicted_gap_is_the_difference_of_refits(stereo):
+    """Noise-free recordings, the present and the planned one, fitted with the rival instead."""
+    (advice,) = advise(stereo, ones(stereo), 0, (SHIFT,), 1.0, (PLAN["farther"],))
+    (gap,) = advice.gaps
+    further = planned(PLAN["farther"], stereo)
+    used = np.zeros(len(stereo.recording.observations.epoch), bool)
+    for rows, weight in zip(further.scene.tables, further.weights, strict=True):
+        used[rows] = weight > 0
+    second = with_pixels(further.scene, used)
+    both = join(stereo.recording, second)
+    state = {
+        name: np.asarray(getattr(stereo.state, name))
+        for name in ("focal", "centre", "distortion", "station_from_camera", "world_from_station")
+    }
+    targets = [np.asarray(s.state.world_from_target) for s in (stereo, further.scene)]
+    state["world_from_target"] = np.concatenate([targets[0], targets[1][1:]])
+    plain = at_values(build(both), state)
+    found = {}
+    for name, hypothesis in (("true", FOCAL), ("rival", SHIFT)):
+        fitted = adjust(plain.with_effects((hypothesis.effect((0.0,)),), ROOM), check=False)
+        assert fitted.converged, fitted.why
+        found[name] = 2.0 * fitted.cost
+    assert gap > 10.0
+    assert found["rival"] - found["true"] == pytest.approx(gap, rel=0.1)
+    # What the present recording alone brings is less.
+    alone = adjust(stereo.with_effects((SHIFT.effect((0.0,)),), ROOM), check=False)
+    assert 2.0 * alone.cost < 0.9 * gap
+
+
+def test_a_larger_effect_and_less_noise_decide_more(stereo):
+    plans = (PLAN["nearer"], PLAN["roll"])
+    first = advise(stereo, ones(stereo), 0, (SHIFT,), 1.0, plans)
+    louder = advise(stereo, ones(stereo), 0, (SHIFT,), 4.0, plans)
+    for one, two in zip(first, louder, strict=True):
+        assert one.plan.key == two.plan.key
+        assert two.gaps[0] == pytest.approx(one.gaps[0] / 4.0)
+        assert one.odds == pytest.approx(np.exp(min(one.gaps[0] / 2.0, 60.0)))
+
+
+# --- one camera before a frontal plate: closed forms ----------------------------------------------
+
+DISTANCE, N_EPOCHS = 2.0, 6
+MARKS = grid_points(5, 5, 0.15) - [0.3, 0.3, 0.0]
+
+
+@pytest.fixture(scope="module")
+def frontal() -> Scene:
+    """A pinhole whose focal length is a little off; everything else is known and held."""
+    camera = Camera(
+        "left",
+        "desk",
+        IMAGE,
+        "pinhole",
+        np.full(2, 1000.0),
+        np.array([639.5, 479.5]),
+        None,
+        HELD,
+        powered_on_s=(-10.0,),
+    )
+    place = np.array([0.0, 0.0, 0.0, 0.0, 0.0, DISTANCE])
+    model = Model(
+        "frontal",
+        (camera,),
+        (Station("desk", "static", HELD),),
+        (Target("plate", grid_names(5, 5), MARKS, "per-epoch", place),),
+        up=(0.0, -1.0, 0.0),
+    )
+    epoch, point = np.divmod(np.arange(N_EPOCHS * len(MARKS)), len(MARKS))
+    nothing, n = np.zeros(len(epoch), int), len(epoch)
+    seen = Observations(epoch, nothing, nothing, point, np.zeros((n, 2)), np.full(n, 0.1))
+    recording = Recording(model, np.arange(N_EPOCHS), 10.0 * np.arange(N_EPOCHS), {}, seen)
+    effect = rival("sensor.focal", "constant", "constant").effect((AMPLITUDE,))
+    scene = build(recording).with_effects((effect,), ROOM)
+    return at_pixels(scene, with_pixels(scene))
+
+
+def size(scene: Scene, weights) -> float:
+    """lambda of the finding: its chi-square where nothing else is free."""
+    return AMPLITUDE**2 * float(_information(scene, weights)[0, 0])
+
+
+def test_focal_length_and_axial_shift_come_apart_with_distance_only(frontal):
+    """rho = (1 + w / r) / sqrt((1 + w)(1 + w / r^2)) for a pair that differs by a factor 1/Z.
+
+    r is the ratio of the distances and w the ratio of the squared image coordinates: 1/r^2 for the
+    same plate. (With w = 1, targets that fill the same field, it is the formula of the table of
+    couplings: 0.774 for 2 m and 20 m.)
+    """
+    twin = rival("mount.shift_z", "constant", "constant")
+    plans = (PLAN["farther"], PLAN["nearer"], PLAN["roll"])
+    advices = {
+        a.plan.key: a.gaps[0] for a in advise(frontal, ones(frontal), 0, (twin,), 1.0, plans)
+    }
+    alone = size(frontal, ones(frontal))
+    assert alone > 10.0
+    # Rolled about the axis at the same distance: still one and the same.
+    assert advices["roll"] < 1e-4 * alone
+    for key, r in (("farther", 2.5), ("nearer", 0.5)):
+        further = planned(PLAN[key], frontal)
+        assert all((weight == 1.0).all() for weight in further.weights)
+        w = 1.0 / r**2
+        total = alone + size(further.scene, further.weights)
+        assert total == pytest.approx(alone * (1.0 + w), rel=1e-3)
+        rho2 = (1.0 + w / r) ** 2 / ((1.0 + w) * (1.0 + w / r**2))
+        assert advices[key] == pytest.approx(total * (1.0 - rho2), rel=0.01)
+
+
+def test_a_pair_that_distance_does_not_part(frontal):
+    """Principal point and detection are the same at every distance and attitude."""
+    effect = rival("sensor.cx", "constant", "constant").effect((0.05,))
+    scene = frontal.with_effects((effect,), ROOM)
+    twin = rival("detect.u", "constant", "constant")
+    for advice in advise(scene, ones(scene), 0, (twin,), 1.0, tuple(PLAN.values())):
+        assert advice.gaps[0] < 1e-3 and not advice.decides
+
+
+# --- plans ----------------------------------------------------------------------------------------
+
+
+def plate_poses(scene: Scene) -> np.ndarray:
+    return np.asarray(scene.state.world_from_target)[scene.target_row[-1]]
+
+
+def middles_of(scene: Scene) -> np.ndarray:
+    """The middle of the plate's marks in the world, epoch by epoch (m)."""
+    poses, points = plate_poses(scene), scene.model.targets[-1].points
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    return Rotation.from_rotvec(poses[:, :3]).apply(middle) + poses[:, 3:]
+
+
+def eye_of(scene: Scene) -> np.ndarray:
+    """The middle of the two cameras."""
+    station = np.array(scene.state.world_from_station)[0]
+    mounted = np.array(scene.state.station_from_camera)[:, 3:]
+    return (Rotation.from_rotvec(station[:3]).apply(mounted) + station[3:]).mean(axis=0)
+
+
+@pytest.mark.parametrize(("key", "factor"), [("farther", 2.5), ("nearer", 0.5)])
+def test_distances_are_scaled(stereo, key, factor):
+    before, after = plate_poses(stereo), plate_poses(planned(PLAN[key], stereo).scene)
+    eye = eye_of(stereo)
+    np.testing.assert_allclose(after[:, 3:] - eye, factor * (before[:, 3:] - eye), rtol=1e-12)
+    assert np.array_equal(after[:, :3], before[:, :3])
+
+
+def test_roll_turns_by_a_right_angle_about_the_line_of_sight(stereo):
+    after = planned(PLAN["roll"], stereo)
+    before, moved = plate_poses(stereo), plate_poses(after.scene)
+    sight = middles_of(stereo) - eye_of(stereo)
+    sight /= np.linalg.norm(sight, axis=1, keepdims=True)
+    turn = (
+        Rotation.from_rotvec(moved[:, :3]) * Rotation.from_rotvec(before[:, :3]).inv()
+    ).as_rotvec()
+    half = len(before) // 2
+    np.testing.assert_allclose(turn[:half], 0.0, atol=1e-12)
+    np.testing.assert_allclose(turn[half:], 0.5 * np.pi * sight[half:], atol=1e-9)
+    # The middle of the plate stays where it is, and the reference as a whole.
+    np.testing.assert_allclose(middles_of(after.scene), middles_of(stereo), atol=1e-12)
+    obs = stereo.recording.observations
+    change = np.abs(predicted(after.scene) - predicted(stereo)).max(axis=1)
+    assert change[obs.target == 0].max() < 1e-9
+    assert change[(obs.target == 1) & (obs.epoch >= half)].max() > 10.0
+
+
+def test_the_centre_of_a_rolled_plate_stays_in_the_image(frontal):
+    """Marks about the origin of the plate: a mark at (x, y) comes to (-y, x)."""
+    after = predicted(planned(PLAN["roll"], frontal).scene) - [639.5, 479.5]
+    before = predicted(frontal) - [639.5, 479.5]
+    late = frontal.recording.observations.epoch >= N_EPOCHS // 2
+    np.testing.assert_allclose(after[~late], before[~late], atol=1e-9)
+    expected = np.stack([-before[:, 1], before[:, 0]], axis=1)
+    np.testing.assert_allclose(after[late], expected[late], atol=1e-9)
+
+
+def test_tilt_and_field_keep_the_distance(stereo):
+    before, eye = plate_poses(stereo), eye_of(stereo)
+    distance = np.linalg.norm(before[:, 3:] - eye, axis=1)
+    tilted = plate_poses(planned(PLAN["tilt"], stereo).scene)
+    further = planned(PLAN["tilt"], stereo).scene
+    np.testing.assert_allclose(middles_of(further), middles_of(stereo), atol=1e-12)
+    turn = Rotation.from_rotvec(tilted[:, :3]) * Rotation.from_rotvec(before[:, :3]).inv()
+    np.testing.assert_allclose(turn.magnitude(), 0.7, rtol=1e-9)
+    across = np.einsum("ij,ij->i", turn.as_rotvec(), middles_of(stereo) - eye)
+    np.testing.assert_allclose(across, 0.0, atol=1e-12)
+    swept = plate_poses(planned(PLAN["field"], stereo).scene)
+    np.testing.assert_allclose(np.linalg.norm(swept[:, 3:] - eye, axis=1), distance, rtol=1e-12)
+
+
+def seen_by(scene: Scene, change) -> tuple[np.ndarray, np.ndarray]:
+    """Whether the marks come to lie inside the image, and their weights, when poses change."""
+    further = planned(Plan("other", "other places", poses=change), scene)
+    pixel = predicted(further.scene)
+    inside = ((pixel > 0) & (pixel < np.array(IMAGE) - 1)).all(axis=1)
+    weight = np.zeros(len(inside))
+    for rows, own in zip(further.scene.tables, further.weights, strict=True):
+        weight[rows] = own
+    return inside, weight
+
+
+def test_marks_outside_the_image_have_no_weight(frontal):
+    inside, weight = seen_by(frontal, lambda poses, middles, eye, up: poses + [0, 0, 0, 1.3, 0, 0])
+    assert 0 < inside.sum() < len(inside)
+    assert np.array_equal(weight, inside.astype(float))
+
+
+def test_marks_behind_the_camera_have_no_weight(frontal):
+    behind = [0.0, 0.0, 0.0, 0.0, 0.0, -2.0 * DISTANCE]
+    _, weight = seen_by(frontal, lambda poses, middles, eye, up: poses + behind)
+    assert not weight.any()
+
+
+@pytest.mark.parametrize("key", ["tilt", "field"])
+def test_plans_for_a_camera_that_looks_straight_down(frontal, key):
+    model = replace(frontal.model, up=(0.0, 0.0, -1.0))
+    scene = replace(frontal, recording=replace(frontal.recording, model=model))
+    assert np.isfinite(plate_poses(planned(PLAN[key], scene).scene)).all()
+
+
+def test_motion_is_reversed_and_power_and_time_change(stereo, frontal):
+    reverse = planned(PLAN["reverse"], stereo).scene.recording
+    # The other way, and twice as fast.
+    old = stereo.recording.velocities["plate"]
+    assert np.array_equal(reverse.velocities["plate"], -2.0 * old)
+    assert np.array_equal(reverse.time, stereo.recording.time)
+    restart = planned(PLAN["restart"], frontal).scene.recording
+    assert restart.model.cameras[0].powered_on_s == (-10.0, 25.0)
+    longer = planned(PLAN["longer"], stereo).scene.recording
+    assert longer.drivers is not None and stereo.recording.drivers is not None
+    for one, two in (
+        (stereo.recording.time, longer.time),
+        (stereo.recording.drivers.time, longer.drivers.time),
+    ):
+        np.testing.assert_allclose(np.diff(two), 2.0 * np.diff(one))
+    cycle = planned(PLAN["cycle"], stereo).scene.recording
+    assert cycle.drivers is not None
+    was = stereo.recording.drivers.channels["body_degC"]
+    now = cycle.drivers.channels["body_degC"]
+    assert now.min() == pytest.approx(was.mean()) and now[-1] == pytest.approx(was.mean())
+    assert np.ptp(now) <= 2.0 * np.ptp(was) + 1e-12
+
+
+def test_a_plan_needs_what_it_changes(stereo, frontal):
+    could = {plan.key: possible(plan, stereo.recording) for plan in PLANS}
+    assert not could.pop("restart") and all(could.values())
+    recording = frontal.recording
+    assert not possible(PLAN["cycle"], recording)
+    assert not possible(PLAN["reverse"], recording)
+    assert possible(PLAN["restart"], recording)
+    wind = Drivers(recording.time, {"wind_m_s": recording.time})
+    assert not possible(PLAN["cycle"], replace(recording, drivers=wind))
+    still = Target("plate", grid_names(5, 5), MARKS, "static", HELD)
+    held = replace(recording, model=replace(recording.model, targets=(still,)))
+    for plan in PLANS:
+        if plan.poses is not None:
+            assert possible(plan, recording) and not possible(plan, held)
+    assert not possible(PLAN["longer"], replace(recording, timed=False))
+    keys = {a.plan.key for a in advise(stereo, ones(stereo), 0, (SHIFT,), 1.0)}
+    assert keys == set(could)
