@@ -1,9 +1,10 @@
 """The shape of a free-form curve in words: what an engineer would say who looks at the plot."""
 
 import numpy as np
+from scipy.interpolate import BSpline
 
 from jaxvm.physics.effects import Effect
-from jaxvm.physics.forms import N_KNOTS, bump
+from jaxvm.physics.forms import N_KNOTS
 
 _SAMPLES = 200
 _FLAT = 0.12
@@ -15,8 +16,9 @@ def curve(effect: Effect, term: int = 0) -> tuple[np.ndarray, np.ndarray]:
     first, spacing = effect.constants
     x = np.linspace(first + spacing, first + (N_KNOTS - 2) * spacing, _SAMPLES)
     own = np.asarray(effect.amplitudes).reshape(len(effect.terms), N_KNOTS)[term]
-    y = sum(a * np.asarray(bump(x, first + k * spacing, spacing)) for k, a in enumerate(own))
-    return x, np.asarray(y)
+    spline = BSpline.basis_element(spacing * np.arange(-2.0, 3.0), extrapolate=False)
+    knots = first + spacing * np.arange(N_KNOTS)
+    return x, np.nan_to_num(spline(x[:, None] - knots)) @ own
 
 
 def shape_words(effect: Effect) -> str:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from jaxvm.geometry.lenses import LensFamily
 from jaxvm.geometry.poses import Pose, pose_from_vector, se3_log
@@ -82,7 +82,7 @@ class Factor(eqx.Module):
         """How many slots each parameter has: a focal length 2, a pose 6, a point 3."""
 
     @abc.abstractmethod
-    def data(self):
+    def data(self) -> PyTree:
         """PyTree of the recorded values; its leaves lead with the observations."""
 
     @abc.abstractmethod

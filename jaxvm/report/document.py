@@ -42,7 +42,7 @@ def document(diagnosis: Diagnosis) -> dict[str, Any]:
     return _plain(content)
 
 
-def _plain(content):
+def _plain(content: Any) -> Any:
     """Lists, dictionaries and Python's own numbers; JSON has no NaN and no infinity."""
     if isinstance(content, dict):
         return {key: _plain(value) for key, value in content.items()}
