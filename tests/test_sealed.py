@@ -1,4 +1,4 @@
-"""A small sealed set: thirty recordings of a world that shares no code with the model.
+"""A small sealed set: twenty recordings of a world that shares no code with the model.
 
 The world (benchmarks/sealed/world) is plain numpy, written from the physics. What a recording can
 show is told by the world's own estimate of the part that survives the adjustment ("visible"). The
@@ -19,7 +19,7 @@ from jaxvm.report import document
 
 SEALED = Path(__file__).parents[1] / "benchmarks" / "sealed"
 SEED = 20261121
-KINDS = ("board", "station", "stereo")
+KINDS = ("board", "stereo")
 EACH = 10
 EMPTY = 3
 CLEAR = 150.0
@@ -100,7 +100,7 @@ def test_clear_physics_is_named(diagnosed):
         and truth["hidden"][0]["visible"] >= CLEAR
         and truth["hidden"][0]["effect"] not in RANDOM
     ]
-    assert len(clear) >= 8
+    assert len(clear) >= 5
     right = [bool(set(h["rows"]) & _rows_of_set(report)) for h, report in clear]
     wrong = [
         (h["effect"], [f["physics"] for f in report["findings"]])
@@ -118,6 +118,6 @@ def test_what_is_found_improves_the_held_out_epochs(diagnosed):
 
 def test_the_recordings_tell_nothing(diagnosed, world):
     keys = Counter(h["effect"] for truth, _ in diagnosed for h in truth["hidden"])
-    assert len(keys) >= 10
+    assert len(keys) >= 8
     texts = [report["recording"] for _, report in diagnosed]
     assert not any(key in text for key in keys for text in texts)

@@ -33,10 +33,12 @@ class Advice:
 
     Attributes:
         plan: the further recording.
+        rivals: what the finding may be mistaken for.
         gaps: expected gap in chi-square to each rival, of both recordings together.
     """
 
     plan: Plan
+    rivals: tuple[Hypothesis, ...]
     gaps: tuple[float, ...]
 
     @property
@@ -70,7 +72,12 @@ def advise(
         variance: of unit weight.
         plans: further recordings to weigh.
     """
-    own = [_with_rival(scene, rival) for rival in rivals]
+    pairs = [(rival, _with_rival(scene, rival)) for rival in rivals]
+    # A rival for which there is no room would need programs of its own; it is left out.
+    pairs = [(rival, with_rival) for rival, with_rival in pairs if with_rival.room == scene.room]
+    if not pairs:
+        return []
+    rivals, own = (tuple(part) for part in zip(*pairs, strict=True))
     now = [_information(with_rival, weights) for with_rival in own]
     found = []
     for plan in plans:
@@ -83,7 +90,7 @@ def advise(
             bound = further.scene.with_effects(with_rival.fitted_effects(), room)
             total = present + _information(bound, further.weights)
             gaps.append(_gap(with_rival, place, total) / variance)
-        found.append(Advice(plan, tuple(gaps)))
+        found.append(Advice(plan, rivals, tuple(gaps)))
     sure = 2.0 * DECIDED
     return sorted(found, key=lambda advice: -min(min(advice.gaps), sure))
 

@@ -220,7 +220,8 @@ def _confirmed(
     that is why earlier findings are looked at again after each new one.
     """
     scene = current.scene
-    window = memory(scene, parts.residuals(current))
+    # Without a clock neighbours in the list are alike for other reasons (the board's attitude).
+    window = memory(scene, parts.residuals(current)) if scene.recording.timed else 1
     if window == 1:
         return [replace(f, p_value=f.p_independent) for f in findings]
     n_epochs = len(scene.recording.time)

@@ -13,15 +13,15 @@ from jaxvm.network.scene import Scene
 REMEMBERED = 0.04
 """Autocorrelation of residuals at one epoch's distance from which noise counts as correlated."""
 
-LONGEST = 0.2
-"""Longest window, as a share of the recording."""
+LONGEST = 0.3
+"""Longest memory that noise may have, as a share of the recording."""
 
 
 def memory(scene: Scene, residual: np.ndarray) -> int:
     """Epochs over which the residuals of a mark, or the mean residuals of a view, remember.
 
     The first distance at which the pooled autocorrelation is below `REMEMBERED`; 1 for noise that
-    is independent from epoch to epoch.
+    is independent from epoch to epoch, and where they never forget.
 
     Args:
         scene: the fitted scene.
@@ -35,10 +35,11 @@ def memory(scene: Scene, residual: np.ndarray) -> int:
     found = 1
     for label in (mark, view):
         series = _series(label, obs.epoch, residual, n_epochs)
-        for distance in range(1, max(int(LONGEST * n_epochs), 1)):
-            if _autocorrelation(series, distance) < REMEMBERED:
-                break
-            found = max(found, distance + 1)
+        distances = range(1, max(int(LONGEST * n_epochs), 2))
+        faded = [d for d in distances if _autocorrelation(series, d) < REMEMBERED]
+        # What never fades is no noise but physics that is not in the model yet.
+        if faded:
+            found = max(found, faded[0])
     return found
 
 

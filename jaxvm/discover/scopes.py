@@ -56,7 +56,10 @@ class Sharing:
 
 
 def sharing(fitted: Adjustment, place: int, split: Split) -> Sharing | None:
-    """How the bodies of its kind share the effect at `place`; None where there is only one body.
+    """How the bodies of its kind share the effect at `place`.
+
+    None where there is only one body, or where the scene has no room for an effect of each: a wider
+    one is another compiled program, and that costs more than this is worth.
 
     Args:
         fitted: a fit with the effect in.
@@ -71,7 +74,9 @@ def sharing(fitted: Adjustment, place: int, split: Split) -> Sharing | None:
     others = tuple(e for k, e in enumerate(scene.fitted_effects()) if k != place)
     own = tuple(replace(effect, scope=Scope(**{kind: (name,)})) for name in names)
     effects = (*others, *own)
-    apart = split.fit(scene.with_effects(effects, room_for(effects, scene.room)))
+    if room_for(effects, scene.room) != scene.room:
+        return None
+    apart = split.fit(scene.with_effects(effects, scene.room))
     if not apart.converged:
         return None
     variance = apart.variance_factor

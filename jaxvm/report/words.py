@@ -4,6 +4,8 @@ import math
 import re
 from dataclasses import dataclass
 
+import numpy as np
+
 from jaxvm.discover.diagnosis import Diagnosis, Finding
 from jaxvm.discover.shape import shape_words
 from jaxvm.physics.drivers import channel_unit
@@ -172,7 +174,8 @@ def separate_by(finding: Finding) -> str:
     """The recording that would tell it from its doubles."""
     if finding.advice:
         best = finding.advice[0]
-        rival = finding.rivals[0].hypothesis.effect(()).name
+        nearest = int(np.argmin(best.gaps))
+        rival = best.rivals[nearest].effect(()).name
         return f"record {best.plan.words}: expected odds {odds(best.odds)} against “{rival}”"
     entries = finding.hypothesis.entries
     return entries[0].separate_by if entries else "another driver's range, another geometry"
