@@ -1,4 +1,4 @@
-"""Does the diagnosis find what a plain pinhole lacks on a real stereo rig, and how good does it get?
+"""Does the diagnosis find what a pinhole lacks on a real stereo rig, and how good does it get?
 
 13 pairs of photographs of a chessboard (OpenCV's samples). The model given is two pinholes without
 distortion; what is missing has to be found. The held-out error is compared with OpenCV's

@@ -17,7 +17,7 @@ from jaxvm.discover import diagnose
 from jaxvm.recording import read_recording
 from jaxvm.report import document
 
-SEALED = Path(__file__).parents[1] / "benchmarks" / "sealed"
+SEALED = Path(__file__).parent
 SEED = 20261121
 KINDS = ("board", "stereo")
 EACH = 10
