@@ -127,12 +127,18 @@ class Hypothesis:
         )
 
 
+_MAPS = {
+    "image": "the detector errs by a smooth map over the image",
+    "plate": "the target stands off its plane by a smooth surface",
+}
+
+
 def describe(hypothesis: Hypothesis) -> str:
     """A hypothesis without a name, in words."""
     meaning = {port.name: port.meaning for port in PORTS}
     first = hypothesis.group.terms[0]
-    words = meaning[first.port]
-    if first.driver != "one":
+    words = _MAPS.get(first.driver, meaning[first.port])
+    if first.driver != "one" and first.driver not in _MAPS:
         words += f", varying with {first.driver.replace('_', ' ')}"
     if hypothesis.course.form != "constant":
         form = FORMS[hypothesis.course.form].words.format(driver=hypothesis.course.driver)

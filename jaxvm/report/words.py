@@ -128,7 +128,7 @@ def size(finding: Finding, final: bool = False) -> str:
         values = [p.value for p in numbers]
         low, high = min(values), max(values)
         unit = numbers[0].unit
-        return f"a curve between {quantity(low, 0.0, unit)} and {quantity(high, 0.0, unit)}"
+        return f"values between {quantity(low, 0.0, unit)} and {quantity(high, 0.0, unit)}"
     words = ", ".join(f"{p.name} {quantity(p.value, p.std, p.unit)}" for p in numbers)
     stuff = substance(effect, numbers)
     return f"{words}: {stuff}" if stuff else words
