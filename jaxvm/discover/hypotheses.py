@@ -6,6 +6,7 @@ family is scored by the same compiled kernel.
 """
 
 import math
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -78,13 +79,16 @@ class Family:
     """Groups with the same number of terms, courses with the same number of bases, all scopes.
 
     Hypothesis (g, c, s) is valid where the scope is of the group's kind; `valid` has the shape
-    [groups, courses, scopes].
+    [groups, courses, scopes]. `kinds` are those of the courses' drivers, `asked` the number of
+    drivers and forms of that kind that the family asks about.
     """
 
     groups: tuple[Group, ...]
     courses: tuple[Course, ...]
     scopes: tuple[Scope, ...]
     valid: np.ndarray
+    kinds: tuple[str, ...]
+    asked: tuple[int, ...]
 
     @property
     def n_terms(self) -> int:
@@ -192,7 +196,7 @@ def enumerate_hypotheses(scene: Scene) -> tuple[Family, ...]:
         ([radial], constant),
         *_free_forms(scene, constant),
     ]
-    families = (_family(groups, own, scopes) for groups, own in candidates if groups and own)
+    families = (_family(scene, groups, own, scopes) for groups, own in candidates if groups and own)
     return tuple(family for family in families if family.valid.any())
 
 
@@ -206,11 +210,8 @@ def member(family: Family, index: tuple[int, int, int], scene: Scene) -> Hypothe
     if group.mark is not None:
         target = scene.model.targets[group.mark[0]]
         scope = Scope(target=(target.name,), point=(target.point_names[group.mark[1]],))
-    kind = driver_kind(scene, course.driver)
+    kind, asked = family.kinds[index[1]], family.asked[index[1]]
     entries = entries_for(group.terms, kind, course.form, channel_kind(course.driver))
-    asked = len(
-        {(c.driver, c.form) for c in family.courses if driver_kind(scene, c.driver) == kind}
-    )
     if group.mark is not None:
         asked *= len(family.groups)
     return Hypothesis(group, course, scope, entries, asked)
@@ -223,8 +224,11 @@ def driver_kind(scene: Scene, driver: str) -> str:
     return "time" if kind == "order" else kind
 
 
-def _family(groups, courses, scopes) -> Family:
+def _family(scene: Scene, groups, courses, scopes) -> Family:
     kinds = [_kind(scope) for scope in scopes]
+    driven = [driver_kind(scene, course.driver) for course in courses]
+    distinct = set(zip(driven, ((c.driver, c.form) for c in courses), strict=True))
+    asked = Counter(kind for kind, _ in distinct)
     valid = np.zeros((len(groups), len(courses), len(scopes)), bool)
     for g, group in enumerate(groups):
         for c, course in enumerate(courses):
@@ -237,9 +241,16 @@ def _family(groups, courses, scopes) -> Family:
                     camera = course.driver.removeprefix("time since power-on of ")
                     valid[g, c, s] &= scope.camera == (camera,)
     # What nothing in this recording has (a rangefinder, say) is not computed either.
-    asked = np.flatnonzero(valid.any(axis=(1, 2)))
-    kept = tuple(groups[g] for g in asked)
-    return Family(kept, tuple(courses), tuple(scopes), valid[asked])
+    seen = np.flatnonzero(valid.any(axis=(1, 2)))
+    kept = tuple(groups[g] for g in seen)
+    return Family(
+        kept,
+        tuple(courses),
+        tuple(scopes),
+        valid[seen],
+        tuple(driven),
+        tuple(asked[kind] for kind in driven),
+    )
 
 
 def _is_patterned(group: Group) -> bool:

@@ -126,7 +126,7 @@ def score_residuals(
     """Score all hypotheses against the arranged residuals, or against another vector.
 
     `variance` is that of unit weight; `signs` [epochs, repetitions] flip whole epochs for the null
-    distribution (`jaxvm.discover.noise.multipliers`).
+    distribution (`jaxvm.discover.noise.multipliers`); all zero where it is not wanted.
 
     With another vector e (whitened, like all observations, and orthogonal to the model's
     tangents) the drop is the part of |e|^2 that a hypothesis explains: how much it resembles e.
@@ -277,6 +277,7 @@ def _kernel(
     padded_residual = jnp.concatenate([residual, jnp.zeros((1, residual.shape[1]))])
     touched = jnp.sum(cells.by(cells.epoch, jnp.sum(cells.residual**2, axis=1)), axis=1) > 0.0
     n_fitted = jnp.maximum(jnp.sum(touched), 2.0)
+    asked = jnp.any(signs != 0.0)  # all zero: the null distribution is not wanted
     # What each epoch contributes to the gradient of the shared unknowns.
     pull = jnp.einsum("ewr,ewrs->es", padded_residual[cells.epoch], padded_half[cells.epoch])
 
@@ -319,7 +320,11 @@ def _kernel(
         amplitude = -back * unit
         # A fitted residual lacks what the shared unknowns take of its epoch, about 1/epochs.
         lost = jnp.maximum(1.0 - 1.0 / n_fitted, 0.5)
-        flipped = jnp.einsum("bce,er->bcr", part_w, signs) / jnp.sqrt(lost)
+        flipped = jax.lax.cond(
+            asked,
+            lambda: jnp.einsum("bce,er->bcr", part_w, signs) / jnp.sqrt(lost),
+            lambda: jnp.zeros((b, columns, signs.shape[1])),
+        )
         null_drop = jnp.sum(flipped**2, axis=1)
 
         seen = jnp.max(jnp.diagonal(scaled, axis1=1, axis2=2), axis=1)

@@ -32,10 +32,8 @@ def smallest_visible(
         for g in range(len(scores.family.groups)):
             for c, course in enumerate(scores.family.courses):
                 s = int(np.argmin(detectable[g, c]))
-                if not np.isfinite(detectable[g, c, s]) or course.form not in (
-                    "constant",
-                    "linear",
-                ):
+                known = course.form in ("constant", "linear")
+                if not known or not np.isfinite(detectable[g, c, s]):
                     continue
                 hypothesis = member(scores.family, (g, c, s), scene)
                 for entry in hypothesis.entries:

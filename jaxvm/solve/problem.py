@@ -38,7 +38,10 @@ class Packets(eqx.Module):
 
 
 def pack(factor: Factor, layout: Layout, unknowns: Unknowns) -> Packets:
-    """Group the observations of a table by the unknowns that they touch."""
+    """Group the observations of a table by the unknowns that they touch.
+
+    A packet with very many observations is cut into several, so that little is filled up.
+    """
     own = np.asarray(factor.slots)[: factor.n_real]
     effects = np.concatenate([layout.all("amplitude"), layout.all("constant")])
     slots = np.concatenate([own, np.tile(effects, (len(own), 1))], axis=1)
@@ -51,13 +54,25 @@ def pack(factor: Factor, layout: Layout, unknowns: Unknowns) -> Packets:
     order = np.argsort(packet, kind="stable")
     starts = np.concatenate([[0], np.cumsum(counts)])[:-1]
     rank = np.arange(len(packet)) - starts[packet[order]]
-    # Sizes are rounded up, so that some missing points or views are no other program.
-    width, height = rounded(counts.max(initial=1)), rounded(len(distinct))
+    width = _best_width(counts)
+    pieces = np.concatenate([[0], np.cumsum(-(-counts // width))])
+    # The number of packets is rounded up, so that some missing views are no other program.
+    height = rounded(int(pieces[-1]))
     rows = np.full((height, width), factor.slots.shape[0])
-    rows[packet[order], rank] = order
-    spare = np.full((height - len(distinct), distinct.shape[1]), unknowns.n)
-    distinct = np.concatenate([distinct, spare])
-    return Packets(jnp.asarray(rows), jnp.asarray(distinct), tuple(int(k) for k in live))
+    rows[pieces[packet[order]] + rank // width, rank % width] = order
+    columns = np.full((height, distinct.shape[1]), unknowns.n)
+    columns[: pieces[-1]] = np.repeat(distinct, np.diff(pieces), axis=0)
+    return Packets(jnp.asarray(rows), jnp.asarray(columns), tuple(int(k) for k in live))
+
+
+_PACKET_COST = 16
+"""What the scatter of a packet costs, in rows of a packet product."""
+
+
+def _best_width(counts: Int[np.ndarray, " packets"]) -> int:
+    """Power of two at which rows, filled-up ones too, and packets cost least together."""
+    widths = [1 << k for k in range(int(counts.max(initial=1)).bit_length() + 1)]
+    return min(widths, key=lambda width: np.sum(-(-counts // width)) * (width + _PACKET_COST))
 
 
 class Normal(eqx.Module):
