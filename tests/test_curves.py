@@ -38,7 +38,7 @@ def splines(x: np.ndarray) -> np.ndarray:
 
 def test_splines_of_a_curve_sum_to_one_inside():
     rows = splines(np.linspace(LOW, HIGH, 301))
-    assert rows.shape == (N_KNOTS, 301)
+    assert rows.shape == (N_KNOTS["curve"], 301)
     assert (rows >= 0.0).all()
     np.testing.assert_allclose(rows.sum(axis=0), 1.0, rtol=1e-13)
     # Each of them is needed, and beyond the interval the sum falls.
@@ -171,7 +171,7 @@ def test_a_free_form_curve_explains_a_turn_that_no_form_describes(turning):
     before, after = 2.0 * fitted.cost_before, 2.0 * fitted.cost
     assert (before - after) / (before - n) > 0.9
     assert fitted.variance_factor == pytest.approx(1.0, abs=0.25)
-    weights = np.asarray(fitted.scene.state.amplitude)[:N_KNOTS]
+    weights = np.asarray(fitted.scene.state.amplitude)[: N_KNOTS["curve"]]
     numbers = jnp.array([BASIS_INDEX[name] for name in FORMS["curve"].bases])
     rows = np.asarray(all_bases(numbers, jnp.asarray(time), time, jnp.array(constants)))
     assert np.corrcoef(weights @ rows, chirp)[0, 1] > 0.95
@@ -179,5 +179,5 @@ def test_a_free_form_curve_explains_a_turn_that_no_form_describes(turning):
 
 def test_few_epochs_carry_no_curve(turning):
     scene, _, _ = turning
-    mask = np.arange(N_EPOCHS) < 2 * N_KNOTS - 1
+    mask = np.arange(N_EPOCHS) < 2 * N_KNOTS["curve"] - 1
     assert curved_drivers(build(scene.recording.select_epochs(mask))) == []

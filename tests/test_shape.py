@@ -37,7 +37,7 @@ def test_small_ripples_are_no_swings():
 def test_the_strongest_term_of_a_curve_speaks():
     """Amplitudes at the knots of a wave; the other term is a hundred times weaker."""
     first, spacing = curve_constants(0.0, 8.0)
-    knots = first + spacing * np.arange(N_KNOTS)
+    knots = first + spacing * np.arange(N_KNOTS["curve"])
     wave, slope = np.sin(2.0 * np.pi * knots / 4.0), 0.01 * knots
     effect = Effect(
         "turn",

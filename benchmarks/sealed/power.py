@@ -4,7 +4,7 @@ Computed with the key, from the noise-free change e that an effect makes to the 
 plain model fitted to the recording with that change taken away (so that it is the truth about which
 things are linear, and that its residuals are noise alone). With e whitened,
 
-    lambda = |M e|^2 / variance,
+    lambda = |M e|^2 / variance  (over e' C e / e' e where the noise is correlated),
 
 M the projector on what the plain model does not absorb, is the drop of chi-square that naming the
 effect perfectly is expected to give. A hypothesis that gives the drop d on e is worse by
@@ -19,22 +19,22 @@ from names import Facts
 from scipy.spatial.transform import Rotation
 
 from jaxvm.discover.cells import Arrangement, Cells, arrange
-from jaxvm.discover.diagnose import GROSS
-from jaxvm.discover.heldout import Split, hold_out, range_weights_of, split, weights_of
+from jaxvm.discover.gross import without_gross_errors
+from jaxvm.discover.heldout import Split, hold_out, split
 from jaxvm.discover.hypotheses import enumerate_hypotheses, member
 from jaxvm.discover.score import Battery, Ranking, battery, score_residuals
 from jaxvm.network.residual import whitening
 from jaxvm.network.scene import Scene, build
 from jaxvm.network.start import start
 from jaxvm.recording import Recording
-from jaxvm.solve.adjust import Adjustment, adjust
+from jaxvm.solve.adjust import Adjustment
 from jaxvm.solve.snooping import robust_variance
 
 ROOM = (16, 8)
 """Columns and constants kept free for effects: the diagnosis' compiled programs are used again."""
 
-ROUNDS = 12
-"""At most so many gross errors of one image are set aside."""
+REPETITIONS = 199
+"""Like the diagnosis' null distribution, for the same reason; it is not asked for here."""
 
 ROLL_DEG = 10.0
 
@@ -93,7 +93,7 @@ def _with(record, **parts):
     return type(record)(**(vars(record) | parts))
 
 
-def shown(recording: Recording, change: Change, each: list[Change]) -> Shown:
+def shown(recording: Recording, change: Change, each: list[Change], noise: dict) -> Shown:
     """What a recording can show of its hidden effects.
 
     Args:
@@ -101,6 +101,7 @@ def shown(recording: Recording, change: Change, each: list[Change]) -> Shown:
         change: of the noise-free measurements by all effects together: pixels [observations, 2]
             (px) and ranges [ranges] (m).
         each: the same by each effect alone.
+        noise: entry "noise" of the key.
     """
     base, parts = plain_fit(without(recording, *change))
     variance = robust_variance(base)
@@ -108,51 +109,18 @@ def shown(recording: Recording, change: Change, each: list[Change]) -> Shown:
     if each:
         arrangement = arrange(base)
         asked = battery(base.scene, arrangement, enumerate_hypotheses(base.scene))
-        effects = tuple(_power(base, arrangement, asked, variance, *own) for own in each)
+        effects = tuple(_power(base, arrangement, asked, variance, noise, *own) for own in each)
     floor = parts.evaluate(base.scene).rms_px
     return Shown(effects, floor, variance, facts_of(base.scene))
 
 
 def plain_fit(recording: Recording) -> tuple[Adjustment, Split]:
-    """The plain model fitted to the epochs that are not held out, without gross errors.
-
-    A gross error pulls its whole image along, so only the worst of an image goes at a time.
-    """
+    """The plain model fitted to the epochs that are not held out, without gross errors."""
     scene = start(build(recording, ())).with_effects(recording.model.effects, ROOM)
-    held = hold_out(scene)
-    parts = split(scene, held, tuple(np.ones(len(rows)) for rows in scene.tables))
-    base = parts.fit(scene)
-    for _ in range(ROUNDS):
-        worst = _worst_of_images(base, parts)
-        if not any(own.any() for own in worst):
-            break
-        sound = tuple(s * ~own for s, own in zip(parts.sound, worst, strict=True))
-        parts = split(scene, held, sound)
-        base = parts.fit(base.scene)
+    sound = tuple(np.ones(len(rows)) for rows in scene.tables)
+    parts = split(scene, hold_out(scene), sound)
+    base, parts, _ = without_gross_errors(parts.fit(scene), parts)
     return base, parts
-
-
-def _worst_of_images(base: Adjustment, parts: Split) -> tuple[np.ndarray, ...]:
-    """For each pixel table: True for gross errors that are the largest of their image."""
-    scene = base.scene
-    momentary = adjust(
-        scene,
-        weights=weights_of(scene, parts.held, parts.sound),
-        range_weights=range_weights_of(scene, parts.held),
-        active=scene.unknowns.of_one_epoch,
-        check=False,
-    )
-    limit = GROSS * np.sqrt(robust_variance(base))
-    obs = scene.recording.observations
-    image = obs.camera * len(parts.held) + obs.epoch
-    size = np.zeros(len(image))
-    pairs = zip(base.residuals().pixels, momentary.residuals().pixels, strict=True)
-    for rows, (a, b) in zip(scene.tables, pairs, strict=True):
-        size[rows] = np.maximum(np.abs(np.asarray(a)), np.abs(np.asarray(b))).max(axis=1)
-    largest = np.zeros(int(image.max()) + 1)
-    np.maximum.at(largest, image, size)
-    worst = (size > limit) & (size == largest[image])
-    return tuple(worst[rows] for rows in scene.tables)
 
 
 def whitened(base: Adjustment, components: int, pixels, ranges) -> np.ndarray:
@@ -173,24 +141,73 @@ def in_cells(arrangement: Arrangement, values: np.ndarray) -> np.ndarray:
     return padded[arrangement.rows].reshape(arrangement.cells.residual.shape)
 
 
-def projected_square(cells: Cells, e: np.ndarray) -> float:
-    """|M e|^2 = |e|^2 - |(J L^-T)^T e|^2 for a vector in cells."""
+def projected(cells: Cells, e: np.ndarray) -> np.ndarray:
+    """M e = e - J L^-T (J L^-T)^T e for a vector in cells."""
     d = cells.n_local
-    absorbed = jnp.sum(jnp.einsum("nr,nrs->s", e, cells.half[:, :, d:]) ** 2)
+    shared = jnp.einsum("nr,nrs->s", e, cells.half[:, :, d:])
+    absorbed = jnp.einsum("s,nrs->nr", shared, cells.half[:, :, d:])
     if d:
         own = jnp.einsum("nr,nrd->dn", e, cells.half[:, :, :d])
-        absorbed = absorbed + jnp.sum(jnp.sum(cells.by(cells.group, own), axis=2) ** 2)
-    return float(max(np.sum(np.asarray(e) ** 2) - float(absorbed), 0.0))
+        of_group = jnp.sum(cells.by(cells.group, own), axis=2)
+        back = jnp.concatenate([of_group, jnp.zeros((d, 1))], axis=1)[:, cells.group_of]
+        absorbed = absorbed + jnp.einsum("dn,nrd->nr", back, cells.half[:, :, :d])
+    return e - np.asarray(absorbed)
+
+
+def by_rows(arrangement: Arrangement, cells: np.ndarray) -> np.ndarray:
+    """A vector in cells as [all observations, components]."""
+    values = np.zeros((len(arrangement.drivers) + 1, arrangement.components))
+    values[arrangement.rows] = cells.reshape(*arrangement.rows.shape, arrangement.components)
+    return values[:-1]
+
+
+def inflation(scene: Scene, effect: np.ndarray, noise: dict) -> float:
+    """Variance of the score of an effect under the noise of the key, over that of white noise.
+
+    Correlated noise has a share that each mark remembers, and one that each image shares, both
+    autoregressive over epochs: lambda is smaller by e' C e / e' e.
+
+    Args:
+        scene: of the recording.
+        effect: what the model does not absorb of it, whitened [pixel observations, 2].
+        noise: entry "noise" of the key.
+    """
+    square = float(np.sum(effect**2))
+    if noise["type"] != "correlated" or square == 0.0:
+        return 1.0
+    obs, n_epochs = scene.recording.observations, len(scene.recording.time)
+    rows = np.concatenate(scene.tables)
+    apart = np.abs(np.subtract.outer(np.arange(n_epochs), np.arange(n_epochs)))
+    memory = np.exp(-apart / noise["memory_epochs"])
+    mark = (obs.camera * scene.first_point[-1] + scene.first_point[obs.target] + obs.point)[rows]
+    spread = 0.0
+    for label, share in ((mark, noise["share"]), (obs.camera[rows], noise["image_share"])):
+        series = np.zeros((n_epochs, int(label.max()) + 1, 2))
+        np.add.at(series, (obs.epoch[rows], label), effect)
+        spread += share * float(np.einsum("kmc,kl,lmc->", series, memory, series))
+    white = 1.0 - noise["share"] - noise["image_share"]
+    return white + spread / square
 
 
 def _power(
-    base: Adjustment, arrangement: Arrangement, asked: Battery, variance: float, pixels, ranges
+    base: Adjustment,
+    arrangement: Arrangement,
+    asked: Battery,
+    variance: float,
+    noise: dict,
+    pixels: np.ndarray,
+    ranges: np.ndarray,
 ) -> Power:
     scene = base.scene
     e = whitened(base, arrangement.components, pixels, ranges)
     full = float(np.sum(e**2))
-    square = projected_square(arrangement.cells, in_cells(arrangement, e))
-    still = np.zeros((len(scene.recording.time), 1))
+    left = by_rows(arrangement, projected(arrangement.cells, in_cells(arrangement, e)))
+    square = float(np.sum(left**2))
+    n_pixels = sum(map(len, scene.tables))
+    # Remembering noise makes effect and gaps count less, by one factor.
+    spread = inflation(scene, left[:n_pixels], noise)
+    variance = variance * spread
+    still = np.zeros((len(scene.recording.time), REPETITIONS))
     alike = score_residuals(scene, arrangement, asked, variance, still, residual=e)
     drops, evidence = best_by_name(alike, scene, variance, np.log(np.count_nonzero(e)))
     return Power(
@@ -207,11 +224,11 @@ def best_by_name(
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Largest drop, and largest drop less `price` for each unknown, over hypotheses of each name.
 
-    A hypothesis has the first of its names.
+    A hypothesis counts for each of its names.
     """
     drops: dict[str, float] = {}
     evidence: dict[str, float] = {}
-    known: dict[tuple, str] = {}
+    known: dict[tuple, tuple[str, ...]] = {}
     for scores in ranking.scores:
         family = scores.family
         over_scopes = np.where(scores.valid, scores.drop, 0.0).max(axis=2) / variance
@@ -220,11 +237,12 @@ def best_by_name(
                 key = (group, course.driver, course.form)
                 if key not in known:
                     entries = member(family, (g, c, 0), scene).entries
-                    known[key] = entries[0].id if entries else ""
-                name, drop = known[key], float(over_scopes[g, c])
+                    known[key] = tuple(entry.id for entry in entries) or ("",)
+                drop = float(over_scopes[g, c])
                 unknowns = family.n_terms * family.n_bases + len(course.constants)
-                drops[name] = max(drops.get(name, 0.0), drop)
-                evidence[name] = max(evidence.get(name, -np.inf), drop - unknowns * price)
+                for name in known[key]:
+                    drops[name] = max(drops.get(name, 0.0), drop)
+                    evidence[name] = max(evidence.get(name, -np.inf), drop - unknowns * price)
     return drops, evidence
 
 

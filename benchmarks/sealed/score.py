@@ -57,7 +57,7 @@ def show(folder: Path, entry: dict) -> dict:
 
     keep_compiled()
     recording = read_recording(folder / "recordings" / entry["id"])
-    return shown(recording, *sealed_changes(folder, entry)).as_dict()
+    return shown(recording, *sealed_changes(folder, entry), entry["noise"]).as_dict()
 
 
 def sealed_changes(

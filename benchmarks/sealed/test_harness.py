@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from judge import _sizes, claims, covered, judge
 from names import Facts, same_name, same_place
-from power import facts_of, in_cells, plain_fit, projected_square, shown, whitened
+from power import facts_of, in_cells, plain_fit, projected, shown, whitened
 from tally import wilson
 
 from jaxvm.discover.cells import arrange
@@ -37,7 +37,7 @@ def test_projection_against_dense(small):
     base, _ = plain_fit(recording)
     arrangement = arrange(base)
     e = whitened(base, arrangement.components, *change)
-    square = projected_square(arrangement.cells, in_cells(arrangement, e))
+    square = np.sum(projected(arrangement.cells, in_cells(arrangement, e)) ** 2)
 
     problem = base.problem
     jacobian = jax.jacfwd(lambda x: jax.tree.leaves(problem.residual(x)))(base.x)
@@ -57,7 +57,7 @@ def test_projection_against_dense(small):
 
 def test_power_names_what_was_hidden(small):
     recording, change = small
-    found = shown(recording, change, [change])
+    found = shown(recording, change, [change], {"type": "white"})
     own = found.effects[0]
     assert own.expected_drop > 50.0
     # A slip is a hypothesis of the catalogue: it takes all of its own drop.

@@ -22,13 +22,13 @@ class Accepted:
 
     Attributes:
         chosen: the candidate, refitted.
-        near: others that were refitted and fell behind only a little.
+        near: others that were refitted and fell behind only a little, best first.
         heldout: its errors on the held-out epochs.
         gain: what it improves there.
     """
 
     chosen: Candidate
-    near: tuple[Hypothesis, ...]
+    near: tuple[Candidate, ...]
     heldout: HeldOut
     gain: Gain
 
@@ -64,8 +64,8 @@ def accept(
             if proof.proven:
                 gap = max(_OPEN[0], _OPEN[1] * abs(candidate.evidence))
                 others = tuple(
-                    c.hypothesis
-                    for c in refitted
+                    c
+                    for c in sorted(refitted, key=lambda c: -c.evidence)
                     if c is not candidate and candidate.evidence - c.evidence < gap
                 )
                 return Accepted(candidate, others, tried, proof)

@@ -33,23 +33,38 @@ CURVED = (
 """Ports, together or alone, that a free-form curve may drive."""
 
 
-def curve_constants(low: float, high: float) -> tuple[float, float]:
+CURVED_FAST = (
+    ("mount.turn_x", "mount.turn_y"),
+    ("mount.turn_x",),
+    ("mount.turn_y",),
+    ("sensor.focal",),
+    ("target.scale",),
+)
+"""The same for a fine curve of time: it has so many unknowns that only what matters is asked."""
+
+
+def curve_constants(low: float, high: float, form: str = "curve") -> tuple[float, float]:
     """First knot and spacing of a free-form curve between two values of its driver."""
-    spacing = (high - low) / (N_KNOTS - 3)
+    spacing = (high - low) / (N_KNOTS[form] - 3)
     return low - spacing, spacing
 
 
-def curved_drivers(scene: Scene) -> list[tuple[str, tuple[float, float]]]:
-    """Time-like drivers that a curve may follow, with the constants of the curve."""
+def curved_drivers(scene: Scene, form: str = "curve") -> list[tuple[str, tuple[float, float]]]:
+    """Time-like drivers that a curve may follow, with the constants of the curve.
+
+    A curve follows recorded quantities, too, a fine one time alone.
+    """
     channels = scene.network.channels
     time = np.asarray(channels.epoch_time)
-    if len(time) < 2 * N_KNOTS:
+    if len(time) < 2 * N_KNOTS[form]:
         return []
     found = []
     for name, kind in zip(channels.names, channels.kinds, strict=True):
         values = np.interp(time, channels.time, channels.values[channels.index(name)])
-        if kind in ("time", "quantity") and np.ptp(values) > 0.0:
-            found.append((name, curve_constants(float(values.min()), float(values.max()))))
+        followed = ("time", "quantity") if form == "curve" else ("time",)
+        if kind in followed and np.ptp(values) > 0.0:
+            constants = curve_constants(float(values.min()), float(values.max()), form)
+            found.append((name, constants))
     return found
 
 

@@ -41,7 +41,7 @@ ALPHA = 0.01
 """Family-wise probability to claim something where nothing is hidden."""
 
 _ROOM = (16, 8)
-_FLIPS = 299
+_FLIPS = 199
 _ADVISED = 3
 
 
@@ -93,14 +93,23 @@ def diagnose(
         p_value = ranking.p_value(ranking.best_z())
         if p_value > alpha or len(findings) == max_findings:
             break
+        leading = [
+            item
+            for item in shortlist(ranking, current.scene, variance, parts.n, 12)
+            if not any(item[0].covered(f.hypothesis) for f in findings)
+        ]
+        if not leading:
+            unproven = "what an unnamed effect left over"
+            break
         progress(f"{ranking.n} hypotheses, p = {p_value:.3g}: refitting the leading ones")
-        leading = shortlist(ranking, current.scene, variance, parts.n, 12)
         accepted = accept(current, leading, parts, best_heldout, seed, hopeless)
         if isinstance(accepted, str):
             unproven = accepted
             break
         chosen = accepted.chosen
-        weight, doubles = rivals(current.scene, arrangement, asked, chosen, current, parts.n, signs)
+        weight, doubles = rivals(
+            current.scene, arrangement, asked, chosen, accepted.near, current, parts.n, signs
+        )
         findings.append(
             Finding(
                 hypothesis=chosen.hypothesis,
@@ -120,8 +129,8 @@ def diagnose(
                 after=parts.residuals(chosen.adjustment),
                 gain=accepted.gain,
                 ranking=tuple((short(h), e) for h, e, _ in leading),
-                doubles=accepted.near,
-                chosen=next(k for k, (h, _, _) in enumerate(leading) if h is chosen.hypothesis),
+                doubles=tuple(candidate.hypothesis for candidate in accepted.near),
+                chosen=next(k for k, (h, *_) in enumerate(leading) if h.same(chosen.hypothesis)),
             )
         )
         progress(f"found: {chosen.effect.name} ({chosen.effect.scope.words()})")
@@ -195,9 +204,11 @@ def diagnose(
 
 def _with_advice(final: Adjustment, finding: Finding, place: int, parts: Split) -> Finding:
     """A finding with the further recordings that would tell it from its leading rivals."""
-    if not finding.rivals:
+    # Two names for the very same course and place are told apart by other means than recording on.
+    others = [r.hypothesis for r in finding.rivals if not r.hypothesis.same(finding.hypothesis)]
+    leading = tuple(others[:_ADVISED])
+    if not leading:
         return finding
-    leading = tuple(rival.hypothesis for rival in finding.rivals[:_ADVISED])
     found = advise(final.scene, parts.sound, place, leading, final.variance_factor)
     return replace(finding, advice=tuple(found))
 

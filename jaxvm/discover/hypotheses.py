@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaxvm.discover.curves import CURVED, curved_drivers, image_map, plate_map
+from jaxvm.discover.curves import CURVED, CURVED_FAST, curved_drivers, image_map, plate_map
 from jaxvm.network.scene import Scene
 from jaxvm.physics.catalogue import CATALOGUE, Entry, entries_for
 from jaxvm.physics.drivers import channel_kind
@@ -114,6 +114,21 @@ class Hypothesis:
     scope: Scope
     entries: tuple[Entry, ...]
     alternatives: int = 1
+
+    def same(self, other: "Hypothesis") -> bool:
+        """Whether both say the same of the observations, whatever their names."""
+        mine = self.group.terms, self.course.driver, self.course.form, self.scope
+        return mine == (other.group.terms, other.course.driver, other.course.form, other.scope)
+
+    def covered(self, other: "Hypothesis") -> bool:
+        """Whether this would name what another, that has no name, left over at the same place.
+
+        A free-form curve or map that is not quite right leaves a remainder of the same kind,
+        constant or changing, and a name for a remainder is a wrong name.
+        """
+        alike = (self.course.driver == "constant") == (other.course.driver == "constant")
+        unnamed = bool(self.entries) and not other.entries
+        return unnamed and alike and self.scope == other.scope and self.group.mark is None
 
     def effect(self, amplitudes) -> Effect:
         """The hypothesis as an effect with given amplitudes."""
@@ -343,15 +358,15 @@ def _courses_of_time(name: str, since: np.ndarray, span: float, spacing: float) 
 
 def _free_forms(scene: Scene, constant: list[Course]):
     """Curves of ports with time or a quantity, maps over the image and over plates."""
-    drivers = curved_drivers(scene)
-    curves = [Course(name, "curve", constants) for name, constants in drivers]
-    for n in (1, 2, 3):
-        groups = [
-            Group(tuple(Term(port) for port in ports), _entity(ports[0]))
-            for ports in CURVED
-            if len(ports) == n
-        ]
-        yield groups, curves
+    for form, curved in (("curve", CURVED), ("fine curve", CURVED_FAST)):
+        curves = [Course(name, form, own) for name, own in curved_drivers(scene, form)]
+        for n in (1, 2, 3):
+            groups = [
+                Group(tuple(Term(port) for port in ports), _entity(ports[0]))
+                for ports in curved
+                if len(ports) == n
+            ]
+            yield groups, curves
     yield [Group(image_map(), "camera")], constant
     yield [Group(plate_map(), "target")], constant
 

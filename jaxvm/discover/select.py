@@ -14,6 +14,7 @@ from jaxvm.discover.heldout import Split
 from jaxvm.discover.hypotheses import Hypothesis
 from jaxvm.discover.score import Battery, Ranking, score_residuals, top
 from jaxvm.network.scene import Scene
+from jaxvm.physics.catalogue import Entry
 from jaxvm.physics.effects import Effect, room_for
 from jaxvm.physics.forms import FORMS
 from jaxvm.solve.adjust import Adjustment, adjust
@@ -63,17 +64,23 @@ def log_prior(hypothesis: Hypothesis, amplitudes: np.ndarray) -> float:
 
 
 def _plausible(hypothesis: Hypothesis, amplitudes: np.ndarray) -> float:
-    if not hypothesis.entries:
-        return float(np.log(UNNAMED_PRIOR))
+    sizes = [_log_size(entry, hypothesis, amplitudes) for entry in hypothesis.entries]
+    return max([*sizes, float(np.log(UNNAMED_PRIOR))])
+
+
+def _log_size(entry: Entry, hypothesis: Hypothesis, amplitudes: np.ndarray) -> float:
+    """Log plausibility of an effect's size under one of its names."""
     size = float(np.linalg.norm(amplitudes[:: len(FORMS[hypothesis.course.form].bases)]))
     if size == 0.0:
         return 0.0
-    best = -np.inf
-    for entry in hypothesis.entries:
-        low, high = entry.plausible
-        decades = max(np.log10(low / size), np.log10(size / high), 0.0)
-        best = max(best, -3.0 * decades)
-    return max(best, float(np.log(UNNAMED_PRIOR)))
+    low, high = entry.plausible
+    return -3.0 * max(np.log10(low / size), np.log10(size / high), 0.0)
+
+
+def best_named(hypothesis: Hypothesis, amplitudes: np.ndarray) -> Hypothesis:
+    """The hypothesis with its names in the order in which they fit the size."""
+    order = sorted(hypothesis.entries, key=lambda e: -_log_size(e, hypothesis, amplitudes))
+    return replace(hypothesis, entries=tuple(order))
 
 
 def evidence(
@@ -149,7 +156,11 @@ def refit(base: Adjustment, hypothesis: Hypothesis, amplitudes, split: Split) ->
     variance = fitted.variance_factor
     drop = 2.0 * (base.cost - fitted.cost)
     own = evidence(hypothesis, drop, np.asarray(effect.amplitudes), variance, split.n)
-    return Candidate(hypothesis, fitted, own)
+    # Of several names for the same the size decides which comes first.
+    named = best_named(hypothesis, np.asarray(effect.amplitudes))
+    known = (*effects[:-1], named.effect(0.0 * amplitudes))
+    fitted = replace(fitted, scene=replace(fitted.scene, effects=known))
+    return Candidate(named, fitted, own)
 
 
 def hypothesis_constants_held(scene: Scene) -> np.ndarray:
@@ -177,6 +188,7 @@ def rivals(
     arrangement: Arrangement,
     battery: Battery,
     chosen: Candidate,
+    near: tuple[Candidate, ...],
     before: Adjustment,
     n: int,
     signs: np.ndarray,
@@ -184,7 +196,9 @@ def rivals(
     """Hypotheses that the recording can't tell from the chosen one at 20:1.
 
     With e the chosen effect as it stands in the residuals and lambda = |e|^2 its drop of
-    chi-square, a hypothesis that explains the share rho^2 of e is worse by lambda (1 - rho^2).
+    chi-square, a hypothesis that explains the share rho^2 of e is worse by lambda (1 - rho^2): what
+    the recording can be expected to show. Of `near` ones, refitted, what it did show counts, too.
+    Other names for the chosen combination are always rivals.
 
     Returns:
         The posterior weight of the chosen one, and its rivals with theirs.
@@ -208,6 +222,15 @@ def rivals(
         log_odds = -0.5 * gap - 0.5 * (cost - penalty) * np.log(n) + prior - own_prior
         if key not in found or log_odds > found[key].weight:
             found[key] = Rival(hypothesis, float(gap), float(log_odds))
+    for other in near:
+        key, gap = identity(other.hypothesis), chosen.evidence - other.evidence
+        if gap <= DECIDED and key != own_identity and key not in found:
+            shown = 2.0 * (other.adjustment.cost - chosen.adjustment.cost) / variance
+            found[key] = Rival(other.hypothesis, max(float(shown), 0.0), -0.5 * float(gap))
+    for entry in chosen.hypothesis.entries[1:]:
+        named = replace(chosen.hypothesis, entries=(entry,))
+        prior = log_prior(named, np.asarray(chosen.effect.amplitudes))
+        found.setdefault(identity(named), Rival(named, 0.0, float(prior - own_prior)))
     odds = np.array([0.0, *(r.weight for r in found.values())])
     weights = np.exp(odds - np.logaddexp.reduce(odds))
     pairs = zip(found.values(), weights[1:], strict=True)

@@ -14,16 +14,17 @@ _FLAT = 0.12
 def curve(effect: Effect, term: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Driver and value of one term of a free-form curve, over the span of its knots."""
     first, spacing = effect.constants
-    x = np.linspace(first + spacing, first + (N_KNOTS - 2) * spacing, _SAMPLES)
-    own = np.asarray(effect.amplitudes).reshape(len(effect.terms), N_KNOTS)[term]
+    n = N_KNOTS[effect.form]
+    x = np.linspace(first + spacing, first + (n - 2) * spacing, _SAMPLES)
+    own = np.asarray(effect.amplitudes).reshape(len(effect.terms), n)[term]
     spline = BSpline.basis_element(spacing * np.arange(-2.0, 3.0), extrapolate=False)
-    knots = first + spacing * np.arange(N_KNOTS)
+    knots = first + spacing * np.arange(n)
     return x, np.nan_to_num(spline(x[:, None] - knots)) @ own
 
 
 def shape_words(effect: Effect) -> str:
     """The shape of the strongest term of a free-form curve; "" for other forms."""
-    if effect.form != "curve" or not effect.amplitudes:
+    if effect.form not in N_KNOTS or not effect.amplitudes:
         return ""
     curves = [curve(effect, term) for term in range(len(effect.terms))]
     x, y = max(curves, key=lambda pair: np.ptp(pair[1]))

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxvm.geometry.lenses import lens_family
+from jaxvm.geometry.targets import checker
 from jaxvm.network.factors import (
     ClosureFactor,
     EdgeFactor,
@@ -46,8 +47,9 @@ class Tables:
         self.centre = np.array([(p.min(0) + p.max(0)) / 2 for p in points])
         half = np.array([np.ptp(p, axis=0)[:2] / 2 for p in points])
         self.half_size = np.where(half > 0, half, 1.0)
+        self.checker = np.concatenate([checker(t.points) for t in self.model.targets])
 
-    def circumstances(self, epoch, target, pixel, height) -> Circumstances:
+    def circumstances(self, epoch, target, point, pixel, height) -> Circumstances:
         velocity = np.zeros((len(epoch), 6))
         for name, values in self.recording.velocities.items():
             own = target == [t.name for t in self.model.targets].index(name)
@@ -55,7 +57,14 @@ class Tables:
         return Circumstances(
             *map(
                 jnp.asarray,
-                (pixel, height, self.centre[target], self.half_size[target], velocity),
+                (
+                    pixel,
+                    height,
+                    self.centre[target],
+                    self.half_size[target],
+                    self.checker[point],
+                    velocity,
+                ),
             )
         )
 
@@ -99,7 +108,9 @@ class Tables:
                     sigma=jnp.asarray(sigma),
                     weight=jnp.asarray(np.arange(len(chosen)) < real, float),
                     real=jnp.asarray(real),
-                    circumstances=self.circumstances(epoch, target, obs.pixel[chosen], height),
+                    circumstances=self.circumstances(
+                        epoch, target, point, obs.pixel[chosen], height
+                    ),
                     epoch=jnp.asarray(epoch),
                     pattern=jnp.zeros((len(chosen), 0)),
                 )
@@ -125,7 +136,7 @@ class Tables:
             sigma=jnp.asarray(ranges.sigma[:, None]),
             weight=jnp.ones(n),
             circumstances=self.circumstances(
-                ranges.epoch, ranges.target, np.zeros((n, 2)), np.ones(n)
+                ranges.epoch, ranges.target, point, np.zeros((n, 2)), np.ones(n)
             ),
             to_plane=jnp.asarray(to_plane, float),
             measured=jnp.asarray(ranges.distance),

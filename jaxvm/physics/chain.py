@@ -39,6 +39,7 @@ class Circumstances(NamedTuple):
     image_height: Float[Array, ""]  # px
     target_centre: Float[Array, "3"]  # target coordinates, m
     target_half_size: Float[Array, "2"]  # target coordinates, m
+    checker: Float[Array, ""]  # +1 and -1 in turn over the marks of a grid; NaN without a grid
     velocity: Float[Array, "6"]  # of the target's origin in the world: m/s and rad/s
 
 

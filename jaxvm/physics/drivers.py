@@ -40,6 +40,7 @@ OBSERVATION_DRIVERS: dict[str, str] = {
     "motion_v": "px/s",
     "target_x": "half width",
     "target_y": "half height",
+    "checker": "1",
     "up_x": "1",
     "up_y": "1",
     "up_z": "1",
@@ -103,7 +104,8 @@ def observation_drivers(
     `image_x`, `image_y` and `radius` count from the principal point in half image diagonals;
     `row` and `column` from the middle of the image; `incidence` is the angle between the line of
     sight and the target's normal, `incidence_u, _v` the image direction into which the normal
-    leans times sin i cos i (the pattern of the eccentricity of circular marks).
+    leans times sin i cos i (the pattern of the eccentricity of circular marks); `checker` is +1 and
+    -1 in turn over the marks of a grid, NaN without one.
     """
     at = circumstances
     world_from_target = pose_from_vector(sight.world_from_target)
@@ -147,6 +149,7 @@ def observation_drivers(
             motion[1],
             in_target[0],
             in_target[1],
+            at.checker,
             up_cam[0],
             up_cam[1],
             up_cam[2],

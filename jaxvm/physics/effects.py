@@ -216,7 +216,7 @@ def room_for(effects: tuple[Effect, ...], present: tuple[int, int]) -> tuple[int
     columns, constants = capacity(effects)
     if columns <= present[0] and constants <= present[1]:
         return present
-    return 64 * -(-columns // 64), max(16 * -(-constants // 16), present[1])
+    return 80 * -(-columns // 80), max(16 * -(-constants // 16), present[1])
 
 
 def courses(

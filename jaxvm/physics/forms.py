@@ -62,8 +62,10 @@ def bump(x: Course, centre: Float[Array, ""], width: Float[Array, ""]) -> Course
     return jnp.where(s < 1.0, inner, jnp.where(s < 2.0, outer, 0.0))
 
 
-N_KNOTS = 12
-"""Cubic B-splines of a free-form curve."""
+N_KNOTS = {"curve": 12, "fine curve": 30}
+"""Cubic B-splines of a free-form curve, and of one that follows faster changes."""
+
+_MOST_KNOTS = max(N_KNOTS.values())
 
 
 def _knot(k: int):
@@ -90,11 +92,11 @@ BASES: dict[str, Callable[[Course, Course, Constants], Course]] = {
     "sine": lambda x, t, c: jnp.sin(2.0 * jnp.pi * x / c[0]),
     "cosine": lambda x, t, c: jnp.cos(2.0 * jnp.pi * x / c[0]),
     "bump": lambda x, t, c: bump(x, c[0], c[1]),
-    **{f"knot {k}": _knot(k) for k in range(N_KNOTS)},
+    **{f"knot {k}": _knot(k) for k in range(_MOST_KNOTS)},
 }
 """All bases by name. Those that use `t` remember the past and apply to time courses only."""
 
-_PLACED = ("step", "ramp", "bump", "play", *(f"knot {k}" for k in range(N_KNOTS)))
+_PLACED = ("step", "ramp", "bump", "play", *(f"knot {k}" for k in range(_MOST_KNOTS)))
 
 BASIS_INDEX = {name: index for index, name in enumerate(BASES)}
 
@@ -175,14 +177,17 @@ FORMS: dict[str, Form] = {
             (Constant("period", "driver"),),
             "periodically in {driver}",
         ),
-        Form(
-            "curve",
-            tuple(f"knot {k}" for k in range(N_KNOTS)),
-            (
-                Constant("first knot", "driver", refined=False),
-                Constant("knot spacing", "driver", refined=False),
-            ),
-            "in a free-form curve of {driver}",
+        *(
+            Form(
+                name,
+                tuple(f"knot {k}" for k in range(n)),
+                (
+                    Constant("first knot", "driver", refined=False),
+                    Constant("knot spacing", "driver", refined=False),
+                ),
+                "in a free-form curve of {driver}",
+            )
+            for name, n in N_KNOTS.items()
         ),
     )
 }

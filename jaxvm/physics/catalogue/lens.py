@@ -10,9 +10,17 @@ LENS: tuple[Entry, ...] = (
     Entry(
         "focal-drift", "the focal length drifts with temperature", (39,),
         _FOCAL, ("temperature",), THERMAL, "camera",
-        (5e-7, 1e-3), "growth of the target, shift along the axis", "targets at two ranges",
+        (5e-7, 2e-4), "growth of the target, shift along the axis", "targets at two ranges",
         "The principal distance changes as lens and body expand. All targets grow about the "
         "principal point, at every range.",
+    ),
+    Entry(
+        "device-compensates", "the device changes its own focal length with temperature", (93, 94),
+        _FOCAL, ("temperature",), THERMAL, "camera",
+        (1e-4, 1e-2), "thermal drift of the focal length",
+        "log the device's intrinsics with every frame; switch its compensation off",
+        "The firmware rescales the image by a table of temperatures, and nobody logs it. The "
+        "principal distance changes by far more than lens and body can expand, or the other way.",
     ),
     Entry(
         "focal-quadratic", "the focal length drifts out of proportion to the temperature", (80,),

@@ -107,6 +107,15 @@ TARGET: tuple[Entry, ...] = (
         "off the mark's place with the angle at which the mark is seen.",
     ),
     Entry(
+        "corner-bias", "neighbouring corners are biased to opposite sides", (73,),
+        alternatives(Term("target.point_x", "checker", "linear"),
+                     Term("target.point_y", "checker", "linear")),
+        ALWAYS, ALWAYS, "target",
+        (1e-6, 1e-3), "marks out of place", "another detector, another print, other light",
+        "Spread ink, blur or a wrong white balance moves the corners of a chessboard towards its "
+        "dark or its bright fields. From one corner to the next the side changes.",
+    ),
+    Entry(
         "mark-displaced", "a mark sits in another place", (8,),
         _MARK, ALWAYS, ALWAYS, "mark",
         (1e-5, 1e-2), "detection bias", "look with another camera",
