@@ -21,6 +21,10 @@ from jaxvm.solve.problem import Problem, normal_at
 from jaxvm.solve.reduced import half_rows, packet_of_rows
 
 
+_HALVES = 16
+"""Half rows are filled up to a multiple of this: another lens is no other scoring program."""
+
+
 class Cells(eqx.Module):
     """Residuals and tangents of a fitted scene, arranged in cells.
 
@@ -107,7 +111,8 @@ def arrange(adjustment: Adjustment) -> Arrangement:
             drivers.append(np.asarray(range_driver_table(scene, factor))[:n])
         keys.append(np.stack([group, np.asarray(factor.epoch)[:n], entity], axis=1))
         pad = [(0, 0), (0, components - r.shape[1])]
-        halves.append(np.pad(np.asarray(half)[:n], [*pad, (0, 0)]))
+        wider = -half.shape[2] % _HALVES
+        halves.append(np.pad(np.asarray(half)[:n], [*pad, (0, wider)]))
         residuals.append(np.pad(np.asarray(r)[:n], pad))
         tangents.append(np.pad(np.asarray(tangent)[:n], [*pad, (0, 0)]))
     key = np.concatenate(keys)
