@@ -24,7 +24,7 @@ from jaxvm.physics.effects import Effect, room_for
 from jaxvm.physics.forms import FORMS
 from jaxvm.solve.adjust import with_weights
 from jaxvm.solve.arrow import Arrow, factorise
-from jaxvm.solve.problem import Problem, normal_at, scene_problem
+from jaxvm.solve.problem import normal_at, scene_problem
 
 
 @dataclass(frozen=True)
@@ -105,12 +105,11 @@ def _with_rival(scene: Scene, rival: Hypothesis) -> Scene:
 def _information(scene: Scene, weights: tuple[np.ndarray, ...]) -> np.ndarray:
     """Normal matrix of the shared unknowns, in plain increments, momentary ones eliminated."""
     problem = with_weights(scene_problem(scene), weights)
-    return np.asarray(_reduced(problem, jnp.zeros(problem.n)))
+    return np.asarray(_reduced(normal_at(problem, jnp.zeros(problem.n)).hessian))
 
 
 @eqx.filter_jit
-def _reduced(problem: Problem, x):
-    hessian = normal_at(problem, x).hessian
+def _reduced(hessian: Arrow):
     diagonal = hessian.diagonal()
     scale = jnp.where(diagonal > 0.0, 1.0 / jnp.sqrt(jnp.where(diagonal > 0.0, diagonal, 1.0)), 1.0)
     a, b = hessian.split(scale)

@@ -20,7 +20,6 @@ from jaxvm.solve.arrow import Arrow, factorise
 from jaxvm.solve.problem import Problem, normal_at
 from jaxvm.solve.reduced import half_rows, packet_of_rows
 
-
 _HALVES = 16
 """Half rows are filled up to a multiple of this: another lens is no other scoring program."""
 
