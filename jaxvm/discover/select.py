@@ -212,30 +212,40 @@ def rivals(
     penalty = len(chosen.effect.amplitudes) + len(chosen.effect.constants)
     own_prior = log_prior(chosen.hypothesis, np.asarray(chosen.effect.amplitudes))
     found: dict[tuple, Rival] = {}
+
+    def weigh(hypothesis: Hypothesis, amplitudes: np.ndarray, gap: float, fit: float) -> None:
+        for named in _one_by_one(hypothesis):
+            key = identity(named)
+            log_odds = fit + log_prior(named, np.asarray(amplitudes)) - own_prior
+            if key != own_identity and (key not in found or log_odds > found[key].weight):
+                found[key] = Rival(named, gap, float(log_odds))
+
     for hypothesis, drop, amplitudes in top(alike, scene, 400):
         gap = max(full - drop / variance, 0.0)
-        key = identity(hypothesis)
-        if gap > DECIDED or key == own_identity:
-            continue
-        cost = len(amplitudes) + len(hypothesis.course.constants)
-        prior = log_prior(hypothesis, np.asarray(amplitudes))
-        log_odds = -0.5 * gap - 0.5 * (cost - penalty) * np.log(n) + prior - own_prior
-        if key not in found or log_odds > found[key].weight:
-            found[key] = Rival(hypothesis, float(gap), float(log_odds))
+        if gap <= DECIDED:
+            cost = len(amplitudes) + len(hypothesis.course.constants) - penalty
+            weigh(hypothesis, amplitudes, float(gap), -0.5 * (gap + cost * np.log(n)))
     for other in near:
-        key, gap = identity(other.hypothesis), chosen.evidence - other.evidence
-        if gap <= DECIDED and key != own_identity and key not in found:
-            shown = 2.0 * (other.adjustment.cost - chosen.adjustment.cost) / variance
-            found[key] = Rival(other.hypothesis, max(float(shown), 0.0), -0.5 * float(gap))
-    for entry in chosen.hypothesis.entries[1:]:
-        named = replace(chosen.hypothesis, entries=(entry,))
-        prior = log_prior(named, np.asarray(chosen.effect.amplitudes))
-        found.setdefault(identity(named), Rival(named, 0.0, float(prior - own_prior)))
+        behind = chosen.evidence - other.evidence
+        if behind <= DECIDED and not any(
+            r.hypothesis.same(other.hypothesis) for r in found.values()
+        ):
+            amplitudes = np.asarray(other.effect.amplitudes)
+            gap = 2.0 * (other.adjustment.cost - chosen.adjustment.cost) / variance
+            prior = log_prior(other.hypothesis, amplitudes) - own_prior
+            weigh(other.hypothesis, amplitudes, max(float(gap), 0.0), -0.5 * behind - prior)
+    weigh(chosen.hypothesis, np.asarray(chosen.effect.amplitudes), 0.0, 0.0)
     odds = np.array([0.0, *(r.weight for r in found.values())])
     weights = np.exp(odds - np.logaddexp.reduce(odds))
     pairs = zip(found.values(), weights[1:], strict=True)
     kept = [replace(r, weight=float(w)) for r, w in pairs if w >= 0.01]
     return float(weights[0]), sorted(kept, key=lambda r: -r.weight)
+
+
+def _one_by_one(hypothesis: Hypothesis) -> list[Hypothesis]:
+    """A hypothesis under each of its names alone; itself where it has none."""
+    named = [replace(hypothesis, entries=(entry,)) for entry in hypothesis.entries]
+    return named or [hypothesis]
 
 
 def stacked(adjustment: Adjustment) -> np.ndarray:
