@@ -34,6 +34,7 @@ from jaxvm.network.start import start
 from jaxvm.physics.effects import Effect, capacity
 from jaxvm.recording import Recording
 from jaxvm.solve.adjust import Adjustment, adjust, reference_sigma
+from jaxvm.solve.compiling import forget_compiled_if_many
 from jaxvm.solve.covariance import standard_deviations
 from jaxvm.solve.snooping import robust_variance
 
@@ -70,6 +71,7 @@ def diagnose(
         RankDeficiency: the model has unknowns that the recording does not determine.
     """
     began = time.perf_counter()
+    forget_compiled_if_many()
     progress("start values from the data")
     effects = recording.model.effects if effects is None else effects
     scene = start(build(recording, ()))

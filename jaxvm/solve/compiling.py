@@ -1,6 +1,7 @@
 """Compilation: how long XLA has been at it in this process, and programs that stay on disk."""
 
 import os
+from pathlib import Path
 
 import jax
 import jax.monitoring
@@ -33,3 +34,21 @@ def keep_compiled() -> None:
         jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+_MAPS, _MOST_MAPS = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
+
+
+def forget_compiled_if_many() -> bool:
+    """Forget compiled programs before the process runs out of memory maps; whether it did.
+
+    Linux allows a process some 65,000 maps, every compiled program takes dozens, and beyond the
+    limit XLA ends the process ("LLVM compilation error: Cannot allocate memory"). Whoever works
+    through many recordings of many sizes calls this between them; what is on disk stays there.
+    """
+    if not (_MAPS.exists() and _MOST_MAPS.exists()):
+        return False
+    many = _MAPS.read_bytes().count(b"\n") > 0.5 * int(_MOST_MAPS.read_text())
+    if many:
+        jax.clear_caches()
+    return many
