@@ -133,6 +133,22 @@ def test_prior_pulls_as_its_weight_says(share):
     assert sigma == pytest.approx(s * p / np.hypot(s, p), rel=0.01)
 
 
+@pytest.mark.parametrize("name", ["board", "stereo", "points"])
+def test_packets_hold_every_observation_once_and_little_else(name):
+    known, _ = adjusted(name)
+    problem = scene_problem(known.true_scene())
+    for factor, packets in zip(problem.network.factors(), problem.packets, strict=True):
+        rows, n = np.asarray(packets.rows), factor.slots.shape[0]
+        assert np.array_equal(np.sort(rows[rows < n]), np.arange(factor.n_real))
+        # All rows of a packet touch the same unknowns.
+        free = np.asarray(packets.columns) < problem.n
+        touched = np.asarray(problem.column)[np.asarray(factor.slots)]
+        for own, columns, used in zip(rows, np.asarray(packets.columns), free, strict=True):
+            mine = touched[own[own < n]]
+            assert np.isin(mine[mine < problem.n], columns[used]).all()
+        assert rows.size < 4 * factor.n_real + 64 * len(rows)
+
+
 def test_what_is_known_of_held_parameters_does_no_harm():
     """A table of observations none of whose parameters is free: here a prior on a held centre."""
     known = board_recording(free=frozenset({"focal"}))

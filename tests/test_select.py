@@ -1,0 +1,59 @@
+"""Names of a hypothesis: by size, one by one, and not for what an unnamed effect left over."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jaxvm.discover.hypotheses import Course, Group, Hypothesis
+from jaxvm.discover.select import best_named, identity, log_prior
+from jaxvm.physics.catalogue import entries_for
+from jaxvm.physics.effects import Scope, Term
+
+FOCAL = (Term("sensor.focal"),)
+DRIFT = Hypothesis(
+    Group(FOCAL, "camera"),
+    Course("body_degC", "linear"),
+    Scope(camera=("left",)),
+    entries_for(FOCAL, "quantity", "linear", "temperature"),
+)
+
+
+@pytest.mark.parametrize(
+    "per_kelvin, name",
+    [(3e-5, "focal-drift"), (-3e-5, "focal-drift"), (2e-3, "device-compensates")],
+)
+def test_the_size_decides_between_two_names(per_kelvin, name):
+    assert {entry.id for entry in DRIFT.entries} == {"focal-drift", "device-compensates"}
+    named = best_named(DRIFT, np.array([per_kelvin]))
+    assert named.entries[0].id == name
+    assert set(named.entries) == set(DRIFT.entries)
+    # The likelier name has the larger prior when each stands alone.
+    alone = [replace(named, entries=(entry,)) for entry in named.entries]
+    priors = [log_prior(own, np.array([per_kelvin])) for own in alone]
+    assert priors[0] > priors[1]
+    assert len({identity(own) for own in alone}) == 2
+
+
+def unnamed(driver: str, form: str, *ports: str) -> Hypothesis:
+    return Hypothesis(
+        Group(tuple(map(Term, ports)), "camera"),
+        Course(driver, form),
+        Scope(camera=("left",)),
+        (),
+    )
+
+
+def test_a_remainder_of_what_has_no_name_gets_none():
+    curve = unnamed("time", "curve", "mount.turn_x")
+    assert DRIFT.covered(curve)
+    assert not curve.covered(DRIFT)
+    assert not unnamed("time", "fine curve", "mount.turn_x").covered(curve)
+
+
+def test_another_place_or_another_kind_is_no_remainder():
+    curve = unnamed("time", "curve", "mount.turn_x")
+    assert not replace(DRIFT, scope=Scope(camera=("right",))).covered(curve)
+    assert not replace(DRIFT, course=Course("constant", "constant")).covered(curve)
+    assert not DRIFT.covered(unnamed("constant", "constant", "detect.u"))
+    assert not DRIFT.covered(DRIFT)
