@@ -28,34 +28,24 @@ def rounded(n: int) -> int:
 
 
 class Course(NamedTuple):
-    """What one observation needs of the effects: their patterns and their courses at its epoch.
-
-    The courses may be linearised about `constant`: then `slope` carries their derivative, and the
-    local function depends on the nonlinear constants in its own row alone.
-    """
+    """What one observation needs of the effects: their patterns and their courses at its epoch."""
 
     pattern: Float[Array, " columns"]
     value: Float[Array, " columns"]
-    slope: Float[Array, "columns constants"] | None
-    constant: Float[Array, " constants"]
 
 
 class Row(NamedTuple):
-    """The values at an observation's slots: its own parameters, part by part, and the effects'."""
+    """The values at an observation's slots: its own parameters, part by part, and amplitudes."""
 
     own: tuple[Float[Array, " part"], ...]
     amplitude: Float[Array, " columns"]
-    constant: Float[Array, " constants"]
 
 
 def port_values(
     row: Row, course: Course, ports: Float[Array, "columns ports"]
 ) -> Float[Array, " ports"]:
     """Port values of one observation: what all effects together do to it."""
-    value = course.value
-    if course.slope is not None:
-        value = value + course.slope @ (row.constant - course.constant)
-    return (row.amplitude * value * course.pattern) @ ports
+    return (row.amplitude * course.value * course.pattern) @ ports
 
 
 class Factor(eqx.Module):

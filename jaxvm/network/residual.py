@@ -24,7 +24,7 @@ from jaxvm.network.factors import (
     port_values,
 )
 from jaxvm.network.state import Layout, State
-from jaxvm.physics.effects import Channels, EffectTable, courses
+from jaxvm.physics.effects import Channels, EffectTable, course_slopes, courses
 from jaxvm.physics.ports import N_PORTS, PortValues
 
 
@@ -102,24 +102,22 @@ def rows(
     values: Float[Array, "columns epochs"],
 ) -> Float[Array, "observations components"]:
     """Predicted minus measured of one table, in its unit."""
-    course = _course(factor, network, flat, values, None)
+    course = _course(factor, network, values)
     return jax.vmap(lambda row, at, data: _local(factor, network, row, at, data))(
         _gather(factor, network, flat), course, factor.data()
     )
 
 
-def _course(factor, network, flat, values, slopes):
-    """Effects at the epochs of a table; None for tables on which effects do not act."""
-    if not isinstance(factor, PixelFactor | RangeFactor) or network.effects.n_columns == 0:
+def _affected(factor: Factor, network: Network) -> bool:
+    """Whether effects act on a table."""
+    return isinstance(factor, PixelFactor | RangeFactor) and network.effects.n_columns > 0
+
+
+def _course(factor, network, values) -> Course | None:
+    """Effects at the epochs of a table; None for tables on which they do not act."""
+    if not _affected(factor, network):
         return None
-    constant = flat[jnp.asarray(network.layout.all("constant"))]
-    n = factor.epoch.shape[0]
-    return Course(
-        factor.pattern,
-        values.T[factor.epoch],
-        None if slopes is None else jnp.moveaxis(slopes, 1, 0)[factor.epoch],
-        jnp.broadcast_to(constant, (n, constant.shape[0])),
-    )
+    return Course(factor.pattern, values.T[factor.epoch])
 
 
 def parts_of(factor: Factor, flat: Float[Array, " n"]) -> tuple[Float[Array, "n part"], ...]:
@@ -131,12 +129,8 @@ def parts_of(factor: Factor, flat: Float[Array, " n"]) -> tuple[Float[Array, "n 
 
 def _gather(factor: Factor, network: Network, flat) -> Row:
     n = factor.slots.shape[0]
-
-    def repeat(name):
-        values = flat[jnp.asarray(network.layout.all(name))]
-        return jnp.broadcast_to(values, (n, values.shape[0]))
-
-    return Row(parts_of(factor, flat), repeat("amplitude"), repeat("constant"))
+    amplitude = flat[jnp.asarray(network.layout.all("amplitude"))]
+    return Row(parts_of(factor, flat), jnp.broadcast_to(amplitude, (n, amplitude.shape[0])))
 
 
 def _local(factor, network, row: Row, course: Course | None, data, disturbance=None):
@@ -151,42 +145,71 @@ def _local(factor, network, row: Row, course: Course | None, data, disturbance=N
 def block_jacobian(
     factor: Factor, network: Network, flat: Float[Array, " n"], live: tuple[int, ...]
 ) -> Float[Array, "observations components slots"]:
-    """Derivative of each row with respect to its slots, own slots, amplitudes, constants.
+    """Derivative of each row with respect to its slots: own slots, amplitudes, constants.
 
     `live` are the positions along [own, amplitude, constant] that are wanted. Reverse mode: a row
-    has one to six components and many slots. The courses of the effects are linearised in their
-    constants, so that the derivative stays local.
+    has one to six components and many slots. Whatever the number of effects, they enter through the
+    ports: one derivative with respect to the ports serves all amplitudes and constants.
     """
+    n, components = factor.slots.shape[0], factor.sigma.shape[1]
+    n_own = factor.slots.shape[1]
+    of_effects = [at for at in live if at >= n_own]
+    acting = _affected(factor, network) and bool(of_effects)
+    own, ports = _derivatives(factor, network, flat, [at for at in live if at < n_own], acting)
+    if not of_effects:
+        return own
+    if not acting:
+        return jnp.concatenate([own, jnp.zeros((n, components, len(of_effects)))], axis=2)
+    effects, layout = network.effects, network.layout
+    constant = flat[jnp.asarray(layout.all("constant"))]
+    amplitude = flat[jnp.asarray(layout.all("amplitude"))]
+    values = courses(effects, constant, network.channels).T[factor.epoch]
+    slopes = jnp.moveaxis(course_slopes(effects, constant, network.channels), 1, 0)[factor.epoch]
+    entering = (ports @ effects.ports.T) * factor.pattern[:, None, :]
+    moved = (entering * amplitude)[..., None] * slopes[:, None]
+    owner = jax.nn.one_hot(effects.constant_index, constant.shape[0], dtype=moved.dtype)
+    by_constants = jnp.reshape(moved, (n, components, -1)) @ jnp.reshape(
+        owner, (-1, constant.shape[0])
+    )
+    every = jnp.concatenate([entering * values[:, None, :], by_constants], axis=2)
+    return jnp.concatenate([own, every[:, :, jnp.asarray(of_effects) - n_own]], axis=2)
+
+
+def _derivatives(factor, network, flat, live: list[int], with_ports: bool):
+    """Derivatives of each row [n, components, ...]: by live slots of its own, and by all ports."""
     row = _gather(factor, network, flat)
-    values, structure = jax.tree.flatten(row)
-    if not live:
-        return jnp.zeros((factor.slots.shape[0], factor.sigma.shape[1], 0))
-    ends = np.cumsum([value.shape[1] for value in values])
+    constant = flat[jnp.asarray(network.layout.all("constant"))]
+    course = None
+    if _affected(factor, network):
+        course = _course(factor, network, courses(network.effects, constant, network.channels))
+    ends = np.cumsum([part.shape[1] for part in row.own])
     first = np.concatenate([[0], ends])[:-1]
     # Only parameters with a wanted slot are differentiated; the others are constants.
-    moving = [k for k in range(len(values)) if any(first[k] <= at < ends[k] for at in live)]
+    moving = [k for k in range(len(ends)) if any(first[k] <= at < ends[k] for at in live)]
     within = np.concatenate([np.arange(first[k], ends[k]) for k in moving] or [[]])
     wanted = jnp.asarray(np.searchsorted(within, np.asarray(live, int)), int)
-    course = None
-    if isinstance(factor, PixelFactor | RangeFactor) and network.effects.n_columns:
-        constant = flat[jnp.asarray(network.layout.all("constant"))]
 
-        def of_constants(c):
-            return courses(network.effects, c, network.channels)
-
-        course = _course(
-            factor, network, flat, of_constants(constant), jax.jacfwd(of_constants)(constant)
-        )
-
-    def local(free, everything, at, data):
-        full = list(everything)
+    def local(free, disturbance, row, at, data):
+        own = list(row.own)
         for k, value in zip(moving, free, strict=True):
-            full[k] = value
-        return _local(factor, network, jax.tree.unflatten(structure, full), at, data)
+            own[k] = value
+        return _local(factor, network, Row(tuple(own), row.amplitude), at, data, disturbance)
 
-    free = [values[k] for k in moving]
-    blocks = jax.vmap(jax.jacrev(local))(free, values, course, factor.data())
-    return jnp.concatenate(blocks, axis=2)[:, :, wanted]
+    n, components = factor.slots.shape[0], factor.sigma.shape[1]
+    free = [row.own[k] for k in moving]
+    if not with_ports:
+        if not moving:
+            return jnp.zeros((n, components, 0)), None
+        blocks = jax.vmap(jax.jacrev(lambda f, *rest: local(f, None, *rest)))(
+            free, row, course, factor.data()
+        )
+        return jnp.concatenate(blocks, axis=2)[:, :, wanted], None
+    blocks, ports = jax.vmap(jax.jacrev(local, argnums=(0, 1)), in_axes=(0, None, 0, 0, 0))(
+        free, jnp.zeros(N_PORTS), row, course, factor.data()
+    )
+    if not moving:
+        return jnp.zeros((n, components, 0)), ports
+    return jnp.concatenate(blocks, axis=2)[:, :, wanted], ports
 
 
 def port_jacobian(
@@ -196,17 +219,7 @@ def port_jacobian(
 
     One reverse pass for each component gives all ports at once.
     """
-    flat = state.flatten()
-    course = _course(
-        factor, network, flat, courses(network.effects, state.constant, network.channels), None
-    )
-
-    def local(disturbance, row, at, data):
-        return _local(factor, network, row, at, data, disturbance)
-
-    return jax.vmap(jax.jacrev(local), in_axes=(None, 0, 0, 0))(
-        jnp.zeros(N_PORTS), _gather(factor, network, flat), course, factor.data()
-    )
+    return _derivatives(factor, network, state.flatten(), [], True)[1]
 
 
 def predict_pixels(state: State, network: Network) -> tuple[Float[Array, "observations 2"], ...]:

@@ -223,12 +223,25 @@ def courses(
     table: EffectTable, constants: Float[Array, " constants"], channels: Channels
 ) -> Float[Array, "columns epochs"]:
     """Course of every column at the epochs. Differentiable in the constants."""
-    x = channels.values[table.channel] - table.reference[:, None]
+    return channels.at_epochs(_on_grid(table, constants[table.constant_index], channels))
+
+
+def course_slopes(
+    table: EffectTable, constants: Float[Array, " constants"], channels: Channels
+) -> Float[Array, "columns epochs 2"]:
+    """Derivative of every column's course with respect to its own two constants."""
     own = constants[table.constant_index]
-    on_grid = jax.vmap(lambda b, xi, c: evaluate_basis(b, xi, channels.time, c))(
-        table.basis, x, own
-    )
-    return channels.at_epochs(on_grid)
+
+    # One shift for all columns: a column depends on no constant but its own two.
+    def shifted(by: Float[Array, "2"]):
+        return channels.at_epochs(_on_grid(table, own + by, channels))
+
+    return jax.jacfwd(shifted)(jnp.zeros(2))
+
+
+def _on_grid(table: EffectTable, own: Float[Array, "columns 2"], channels: Channels):
+    x = channels.values[table.channel] - table.reference[:, None]
+    return jax.vmap(lambda b, xi, c: evaluate_basis(b, xi, channels.time, c))(table.basis, x, own)
 
 
 def form_of(effect: Effect) -> Form:
