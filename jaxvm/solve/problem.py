@@ -164,12 +164,26 @@ class Problem(eqx.Module):
                 packets, self.jacobian(factor, packets, flat) * root[:, :, None], r * root
             )
             place, group, member = split_columns(packets.columns, self.sizes)
-            gradient = gradient.at[packets.columns].add(product)
-            shared = shared.at[place[:, :, None], place[:, None, :]].add(gram)
+            # What a packet has to itself is scattered; what all have in common (effects) is summed
+            # first, for it is most of a wide model.
+            k = sum(at < factor.slots.shape[1] for at in packets.live)
+            common = place[0, k:]
+            place, member = place[:, :k], member[:, :k]
+            gradient = gradient.at[packets.columns[:, :k]].add(product[:, :k])
+            gradient = gradient.at[packets.columns[0, k:]].add(jnp.sum(product[:, k:], axis=0))
+            own, cross = gram[:, :k, :k], gram[:, :k, k:]
+            mixed = jnp.zeros((s + 1, common.shape[0])).at[place].add(cross)
+            shared = shared.at[place[:, :, None], place[:, None, :]].add(own)
+            shared = shared.at[:, common].add(mixed).at[common].add(mixed.T)
+            both = jnp.sum(gram[:, k:, k:], axis=0)
+            shared = shared.at[common[:, None], common].add(both)
             if groups:
                 where = group[:, None, None]
-                coupling = coupling.at[where, member[:, :, None], place[:, None, :]].add(gram)
-                local = local.at[where, member[:, :, None], member[:, None, :]].add(gram)
+                coupling = coupling.at[where, member[:, :, None], place[:, None, :]].add(own)
+                apart = jnp.zeros((groups + 1, d + 1, common.shape[0]))
+                apart = apart.at[group[:, None], member].add(cross)
+                coupling = coupling.at[:, :, common].add(apart)
+                local = local.at[where, member[:, :, None], member[:, None, :]].add(own)
         arrow = Arrow(shared[:s, :s], coupling[:groups, :d, :s], local[:groups, :d, :d])
         return Normal(cost, gradient[: self.n], arrow)
 
