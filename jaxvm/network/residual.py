@@ -158,7 +158,7 @@ def block_jacobian(
     own, ports = _derivatives(factor, network, flat, [at for at in live if at < n_own], acting)
     if not of_effects:
         return own
-    if not acting:
+    if not (acting and isinstance(factor, PixelFactor | RangeFactor)):
         return jnp.concatenate([own, jnp.zeros((n, components, len(of_effects)))], axis=2)
     effects, layout = network.effects, network.layout
     constant = flat[jnp.asarray(layout.all("constant"))]
@@ -176,7 +176,10 @@ def block_jacobian(
 
 
 def _derivatives(factor, network, flat, live: list[int], with_ports: bool):
-    """Derivatives of each row [n, components, ...]: by live slots of its own, and by all ports."""
+    """Derivatives of each row [n, components, ...]: by live slots of its own, and by all ports.
+
+    Without ports their part is empty.
+    """
     row = _gather(factor, network, flat)
     constant = flat[jnp.asarray(network.layout.all("constant"))]
     course = None
@@ -195,21 +198,18 @@ def _derivatives(factor, network, flat, live: list[int], with_ports: bool):
             own[k] = value
         return _local(factor, network, Row(tuple(own), row.amplitude), at, data, disturbance)
 
-    n, components = factor.slots.shape[0], factor.sigma.shape[1]
+    none = jnp.zeros((factor.slots.shape[0], factor.sigma.shape[1], 0))
     free = [row.own[k] for k in moving]
-    if not with_ports:
-        if not moving:
-            return jnp.zeros((n, components, 0)), None
-        blocks = jax.vmap(jax.jacrev(lambda f, *rest: local(f, None, *rest)))(
+    ports = none
+    if with_ports:
+        blocks, ports = jax.vmap(jax.jacrev(local, argnums=(0, 1)), in_axes=(0, None, 0, 0, 0))(
+            free, jnp.zeros(N_PORTS), row, course, factor.data()
+        )
+    else:
+        blocks = jax.vmap(jax.jacrev(lambda own, *rest: local(own, None, *rest)))(
             free, row, course, factor.data()
         )
-        return jnp.concatenate(blocks, axis=2)[:, :, wanted], None
-    blocks, ports = jax.vmap(jax.jacrev(local, argnums=(0, 1)), in_axes=(0, None, 0, 0, 0))(
-        free, jnp.zeros(N_PORTS), row, course, factor.data()
-    )
-    if not moving:
-        return jnp.zeros((n, components, 0)), ports
-    return jnp.concatenate(blocks, axis=2)[:, :, wanted], ports
+    return jnp.concatenate([none, *blocks], axis=2)[:, :, wanted], ports
 
 
 def port_jacobian(
@@ -222,6 +222,7 @@ def port_jacobian(
     return _derivatives(factor, network, state.flatten(), [], True)[1]
 
 
+@eqx.filter_jit
 def predict_pixels(state: State, network: Network) -> tuple[Float[Array, "observations 2"], ...]:
     """Predicted pixels (px) of every table: what a simulation adds its noise to."""
     flat = state.flatten()
