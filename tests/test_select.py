@@ -57,3 +57,12 @@ def test_another_place_or_another_kind_is_no_remainder():
     assert not replace(DRIFT, course=Course("constant", "constant")).covered(curve)
     assert not DRIFT.covered(unnamed("constant", "constant", "detect.u"))
     assert not DRIFT.covered(DRIFT)
+
+
+def test_a_parabola_contains_its_line():
+    parabola = replace(DRIFT, course=Course("body_degC", "quadratic"))
+    assert parabola.contains(DRIFT)
+    assert DRIFT.contains(DRIFT)
+    assert not DRIFT.contains(parabola)
+    assert not replace(parabola, scope=Scope(camera=("right",))).contains(DRIFT)
+    assert not replace(parabola, course=Course("room_degC", "quadratic")).contains(DRIFT)

@@ -206,8 +206,9 @@ def diagnose(
 
 def _with_advice(final: Adjustment, finding: Finding, place: int, parts: Split) -> Finding:
     """A finding with the further recordings that would tell it from its leading rivals."""
-    # Two names for the very same course and place are told apart by other means than recording on.
-    others = [r.hypothesis for r in finding.rivals if not r.hypothesis.same(finding.hypothesis)]
+    # Another name for the same course, and what contains it, fits whatever is recorded further.
+    own = finding.hypothesis
+    others = [r.hypothesis for r in finding.rivals if not r.hypothesis.contains(own)]
     leading = tuple(others[:_ADVISED])
     if not leading:
         return finding

@@ -47,6 +47,9 @@ _PATTERNS: tuple[tuple[str, str, tuple[float, ...]], ...] = (
         for basis in ("sine", "cosine")
     ),
 )
+_TWICE = {("target.point_z", "target_x", "square"), ("target.point_z", "target_y", "square")}
+"""Patterns that are ports by another name: these are `target.bow_x` and `bow_y`."""
+
 _PATTERNED_PORTS = ("detect.u", "detect.v", "sensor.focal", "target.point_z")
 _RADIAL_KNOTS = np.linspace(0.0, 1.0, 7)
 
@@ -120,6 +123,13 @@ class Hypothesis:
         mine = self.group.terms, self.course.driver, self.course.form, self.scope
         return mine == (other.group.terms, other.course.driver, other.course.form, other.scope)
 
+    def contains(self, other: "Hypothesis") -> bool:
+        """Whether another is a special case of this one at the same place: a parabola's line."""
+        terms = set(other.group.terms) <= set(self.group.terms)
+        bases = set(FORMS[other.course.form].bases) <= set(FORMS[self.course.form].bases)
+        driver = self.course.driver == other.course.driver
+        return terms and bases and driver and self.scope == other.scope
+
     def covered(self, other: "Hypothesis") -> bool:
         """Whether this would name what another, that has no name, left over at the same place.
 
@@ -179,6 +189,7 @@ def enumerate_hypotheses(scene: Scene) -> tuple[Family, ...]:
         Group((Term(port, driver, basis, constants),), _entity(port))
         for port in _PATTERNED_PORTS
         for driver, basis, constants in _PATTERNS
+        if (port, driver, basis) not in _TWICE
     ]
     named = [
         Group(terms, entry.entity)
