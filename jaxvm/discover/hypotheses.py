@@ -14,6 +14,7 @@ import numpy as np
 from jaxvm.discover.curves import CURVED, CURVED_FAST, curved_drivers, image_map, plate_map
 from jaxvm.network.scene import Scene
 from jaxvm.physics.catalogue import CATALOGUE, Entry, entries_for
+from jaxvm.physics.catalogue.lens import RINGS
 from jaxvm.physics.drivers import channel_kind
 from jaxvm.physics.effects import Effect, Scope, Term
 from jaxvm.physics.forms import FORMS
@@ -51,7 +52,6 @@ _TWICE = {("target.point_z", "target_x", "square"), ("target.point_z", "target_y
 """Patterns that are ports by another name: these are `target.bow_x` and `bow_y`."""
 
 _PATTERNED_PORTS = ("detect.u", "detect.v", "sensor.focal", "target.point_z")
-_RADIAL_KNOTS = np.linspace(0.0, 1.0, 7)
 
 _MOST_OF_MARKS = 3000
 """Hypotheses about single marks; where marks and instants are many, fewer instants are asked."""
@@ -202,10 +202,6 @@ def enumerate_hypotheses(scene: Scene) -> tuple[Family, ...]:
     named = [group for group in dict.fromkeys(named) if group not in listed]
     fixed = [group for group in named if _is_patterned(group)]
     moving = [group for group in named if group not in fixed]
-    radial = Group(
-        tuple(Term("sensor.focal", "radius", "bump", (float(c), 1 / 6)) for c in _RADIAL_KNOTS),
-        "camera",
-    )
     by_bases = {n: [c for c in courses if len(FORMS[c.form].bases) == n] for n in (1, 2)}
     constant = [Course("constant", "constant")]
     marks = _marks(scene)
@@ -219,7 +215,7 @@ def enumerate_hypotheses(scene: Scene) -> tuple[Family, ...]:
         (_of_size(moving, 2), by_bases[2]),
         (_of_size(moving, 3), by_bases[1]),
         (marks, _courses_of_marks(courses, len(marks))),
-        ([radial], constant),
+        ([Group(RINGS, "camera")], constant),
         *_free_forms(scene, constant),
     ]
     families = (_family(scene, groups, own, scopes) for groups, own in candidates if groups and own)

@@ -3,7 +3,7 @@
 An entry says where an effect enters (terms: ports and patterns), what may drive it, in which forms,
 what kind of entity has it, how large it plausibly is, what it is mistaken for and what separates
 it. Adding named physics is adding an entry; nothing else knows the names. The files follow the
-chain, and so does the order: of two entries for the same combination the earlier gives the name.
+chain. Several entries may stand for the same combination: their sizes decide which comes first.
 """
 
 from jaxvm.physics.catalogue.detection import DETECTION
@@ -29,15 +29,16 @@ def entries_for(
 ) -> tuple[Entry, ...]:
     """The entries that a combination of terms, kind of driver and form belongs to.
 
-    `channel_kind` is the kind of a recorded channel, where `driver_kind` is "quantity": entries
-    that name it come before those that any recorded quantity may drive.
+    `channel_kind` is the kind of a recorded channel, where `driver_kind` is "quantity": where
+    entries name it, those that any recorded quantity may drive are not meant. Several entries are
+    doubles that no recording of these cameras tells apart.
     """
     special = channel_kind if driver_kind == "quantity" else driver_kind
-    known = (
+    known = [
         entry
         for entry in CATALOGUE
         if terms in entry.groups
         and form in entry.forms
         and (special in entry.drivers or driver_kind in entry.drivers)
-    )
-    return tuple(sorted(known, key=lambda entry: special not in entry.drivers))
+    ]
+    return tuple([entry for entry in known if special in entry.drivers] or known)

@@ -6,6 +6,19 @@ from jaxvm.physics.effects import Term
 _FOCAL, _RADIAL = (plain("sensor.focal"),), (plain("lens.k1"),)
 _DECENTRING = pair("lens.p1", "lens.p2")
 
+RINGS = tuple(Term("sensor.focal", "radius", "bump", (k / 6.0, 1.0 / 6.0)) for k in range(7))
+"""A free-form curve of the principal distance over the radius."""
+
+_RADIAL_FIXED = (
+    tuple(Term("sensor.focal", "radius", basis) for basis in ("square", "fourth", "sixth")),
+    *((Term("sensor.focal", "radius", basis),) for basis in ("square", "fourth", "sixth")),
+    plain("lens.k1", "lens.k2", "lens.k3"),
+    plain("lens.k1"),
+    plain("lens.k2"),
+    plain("lens.k3"),
+    RINGS,
+)
+
 LENS: tuple[Entry, ...] = (
     Entry(
         "focal-drift", "the focal length drifts with temperature", (39,),
@@ -86,6 +99,13 @@ LENS: tuple[Entry, ...] = (
         "proportion.",
     ),
     Entry(
+        "defocus-drift", "the spots grow as the lens defocuses with temperature", (40, 72),
+        _RADIAL, ("temperature",), THERMAL, "camera",
+        (1e-6, 1e-3), "drift of the distortion", "record the size of the spots",
+        "The lens leaves its focus as it warms, and lopsided spots grow. Their centroids move "
+        "along the radius, as if the distortion changed.",
+    ),
+    Entry(
         "distortion-warm-up", "the distortion settles after power-on", (43,),
         _RADIAL, ("power-on",), ("onset",), "camera",
         (1e-5, 1e-2), "settling of the focal length", "targets out to the edge of the field",
@@ -108,14 +128,18 @@ LENS: tuple[Entry, ...] = (
     ),
     Entry(
         "radial-beyond-model", "radial distortion beyond the lens model", (42,),
-        (tuple(Term("sensor.focal", "radius", basis) for basis in ("square", "fourth", "sixth")),
-         *((Term("sensor.focal", "radius", basis),) for basis in ("square", "fourth", "sixth")),
-         plain("lens.k1", "lens.k2", "lens.k3"),
-         plain("lens.k1"), plain("lens.k2"), plain("lens.k3")),
+        _RADIAL_FIXED,
         ALWAYS, ALWAYS, "camera",
         (1e-6, 5e-1), "bow of the target", "roll the target in the image",
         "The lens model has too few radial terms for this lens. Rings of residuals about the "
         "axis stay fixed in the image.",
+    ),
+    Entry(
+        "coma", "the spots are smeared outward", (72,),
+        _RADIAL_FIXED, ALWAYS, ALWAYS, "camera",
+        (1e-6, 5e-2), "radial distortion", "another aperture or focus; look at the spots",
+        "Coma or defocus makes the image of a mark lopsided, more so towards the edge. Its "
+        "centroid moves along the radius, as if the lens distorted.",
     ),
     Entry(
         "decentring", "decentring distortion beyond the lens model", (45,),
@@ -123,6 +147,13 @@ LENS: tuple[Entry, ...] = (
         (1e-6, 1e-2), "tilt of the sensor", "targets over the whole field",
         "The lens elements do not share one axis. The residuals are quadratic in the image and "
         "not symmetric.",
+    ),
+    Entry(
+        "window-off-centre", "a dome or a wedged window stands off the axis", (21,),
+        _DECENTRING, ALWAYS, ALWAYS, "camera",
+        (1e-6, 1e-2), "decentring of the lens", "take the window away, or turn it",
+        "The camera does not sit in the middle of its dome, or its window is a wedge. The image is "
+        "bent to one side, like that of a lens whose elements do not share one axis.",
     ),
     Entry(
         "decentring-drift", "the decentring drifts with temperature", (46,),

@@ -131,6 +131,13 @@ SENSOR: tuple[Entry, ...] = (
         "by whole periods of the frame rate.",
     ),
     Entry(
+        "trigger-late", "the camera is triggered late from a moment on", (59,),
+        _DELAY, ("time",), ("step",), "camera",
+        (1e-4, 5e-2), "a lost frame", "a flash that all cameras see; number the frames",
+        "A cable, a filter or a new setting delays the trigger from one moment on. What moves is "
+        "seen too late by this camera, in proportion to its speed.",
+    ),
+    Entry(
         "exposure-delay", "the delay follows the exposure time", (62, 71),
         _DELAY, ("exposure",), ("linear",), "camera",
         (1e-4, 2e-3), "trigger offset", "hold the exposure, reverse the motion",
