@@ -138,10 +138,11 @@ def diagnose(
         progress(f"found: {chosen.effect.name} ({chosen.effect.scope.words()})")
         best_heldout = accepted.heldout
         current = replace(chosen.adjustment, scene=best_heldout.scene)
-        kept = len(findings)
+        former = findings
         current, findings = prune(current, findings, parts.n, parts.fit)
-        if len(findings) < kept:
+        if len(findings) < len(former):
             current, best_heldout = parts.proven(current)
+            findings = _with_heir(current, findings, former, parts)
         findings = _confirmed(findings, current, arrangement, asked, parts, seed)
         if len(findings) > 1 and min(f.p_value for f in findings[-2:]) > alpha:
             break
@@ -223,6 +224,26 @@ def _plain_fit(scene: Scene, every: int) -> tuple[Split, Adjustment, int]:
     fitted = parts.fit(scene, check=True)
     fitted, parts, n_rejected = without_gross_errors(fitted, parts)
     return parts, fitted, n_rejected
+
+
+def _with_heir(
+    current: Adjustment, findings: list[Finding], former: list[Finding], parts: Split
+) -> list[Finding]:
+    """Findings after some were dropped: what those showed, the strongest one shows now."""
+    if not findings:
+        return findings
+    kept = {id(finding) for finding in findings}
+    lost = max(finding.z for finding in former if id(finding) not in kept)
+    effects, room = current.scene.fitted_effects(), current.scene.room
+    first = len(effects) - len(findings)
+    costs = [
+        parts.fit(current.scene.with_effects((*effects[:k], *effects[k + 1 :]), room)).cost
+        for k in range(first, len(effects))
+    ]
+    heir = int(np.argmax(costs))
+    findings = list(findings)
+    findings[heir] = replace(findings[heir], z=max(findings[heir].z, lost))
+    return findings
 
 
 def _confirmed(

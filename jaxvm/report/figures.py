@@ -148,7 +148,7 @@ def heldout_quality(diagnosis: Diagnosis) -> Figure:
     left.axhline(diagnosis.noise_px, color=INK, ls=":", lw=1.0, label="noise, robust")
     left.set_xticks(range(len(steps)), [n for n, _ in steps], rotation=30 if len(steps) > 3 else 0)
     left.set(ylabel="held-out RMS (px)", title="epochs that were never fitted")
-    left.margins(y=0.15)
+    left.margins(y=0.35)
     left.legend(loc="upper right")
     ids = diagnosis.recording.epoch_ids[diagnosis.held]
     scale = _pixels_per_sigma(diagnosis)

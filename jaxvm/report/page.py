@@ -15,6 +15,7 @@ from jaxvm.recording.write import model_text
 from jaxvm.report.document import document
 from jaxvm.report.figures import figures, png
 from jaxvm.report.words import (
+    doubles,
     explanation,
     in_pixels,
     mistaken_for,
@@ -59,6 +60,7 @@ def html(diagnosis: Diagnosis, pictures: dict[str, bytes]) -> str:
         "explanation": explanation,
         "in_pixels": in_pixels,
         "mistaken_for": mistaken_for,
+        "doubles": doubles,
         "nearly_as_good": nearly_as_good,
         "parameters": parameters,
         "odds": odds,

@@ -164,6 +164,16 @@ def nearly_as_good(finding: Finding) -> str:
     return "; ".join(names)
 
 
+def doubles(finding: Finding) -> list[str]:
+    """What this recording can't tell the finding from: name, other driver, place, weight."""
+    told = []
+    for rival in finding.rivals:
+        effect = rival.hypothesis.effect(())
+        other = "" if effect.driver in ("constant", finding.effect.driver) else f", {when(effect)}"
+        told.append(f"{effect.name}{other}, {effect.scope.words()} ({rival.weight:.2f})")
+    return told
+
+
 def mistaken_for(finding: Finding) -> str:
     """What the effect is easily taken for, by the catalogue."""
     entries = finding.hypothesis.entries
@@ -259,10 +269,7 @@ def summary(diagnosis: Diagnosis) -> str:
             f"({100 * gain.interval[0]:.1f} to {100 * gain.interval[1]:.1f} % of chi-square, 95 %)",
         ]
         if finding.rivals:
-            alike = "; ".join(
-                f"{r.hypothesis.effect(()).name}, {r.hypothesis.scope.words()} ({r.weight:.2f})"
-                for r in finding.rivals
-            )
+            alike = "; ".join(doubles(finding))
             lines.append(f"   or        {alike}  [weight of the above {finding.weight:.2f}]")
             lines.append(f"   separate  {separate_by(finding)}")
         if nearly_as_good(finding):
