@@ -1,4 +1,4 @@
-"""A small sealed set: thirty recordings of a world that shares no code with the model.
+"""A small sealed set: twelve recordings of a world that shares no code with the model.
 
 The world (benchmarks/sealed/world) is plain numpy, written from the physics. What a recording can
 show is told by the world's own estimate of the part that survives the adjustment ("visible"). The
@@ -21,7 +21,7 @@ from jaxvm.report import document
 SEALED = Path(__file__).parent.parent / "benchmarks" / "sealed"
 SEED = 20261121
 KIND, LENS = "board", "pinhole"
-COUNT, EMPTY = 30, 6
+COUNT, EMPTY = 12, 4
 CLEAR = 150.0
 """Visible chi-square from which the name has to be right in nearly all cases."""
 
@@ -89,7 +89,7 @@ def test_clear_physics_is_named(diagnosed):
         and truth["hidden"][0]["visible"] >= CLEAR
         and truth["hidden"][0]["effect"] not in RANDOM
     ]
-    assert len(clear) >= 5
+    assert len(clear) >= 3
     right = [bool(set(h["rows"]) & _rows_of_set(report)) for h, report in clear]
     wrong = [
         (h["effect"], [f["physics"] for f in report["findings"]])
@@ -107,6 +107,6 @@ def test_what_is_found_improves_the_held_out_epochs(diagnosed):
 
 def test_the_recordings_tell_nothing(diagnosed, world):
     keys = Counter(h["effect"] for truth, _ in diagnosed for h in truth["hidden"])
-    assert len(keys) >= 8
+    assert len(keys) >= 6
     texts = [report["recording"] for _, report in diagnosed]
     assert not any(key in text for key in keys for text in texts)
