@@ -205,6 +205,8 @@ def _derivatives(factor, network, flat, live: list[int], with_ports: bool):
         blocks, ports = jax.vmap(jax.jacrev(local, argnums=(0, 1)), in_axes=(0, None, 0, 0, 0))(
             free, jnp.zeros(N_PORTS), row, course, factor.data()
         )
+    elif not moving:
+        return none, none
     else:
         blocks = jax.vmap(jax.jacrev(lambda own, *rest: local(own, None, *rest)))(
             free, row, course, factor.data()
