@@ -18,7 +18,7 @@ from jaxvm.discover import diagnose
 from jaxvm.recording import read_recording
 from jaxvm.report import document
 
-SEALED = Path(__file__).parent.parent / "benchmarks" / "sealed"
+SEALED = Path(__file__).parent
 SEED = 20261121
 KIND, LENS = "board", "pinhole"
 COUNT, EMPTY = 12, 4
