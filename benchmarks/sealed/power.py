@@ -19,6 +19,7 @@ from names import Facts
 from scipy.spatial.transform import Rotation
 
 from jaxvm.discover.cells import Arrangement, Cells, arrange
+from jaxvm.discover.diagnose import FLIPS, ROOM
 from jaxvm.discover.gross import without_gross_errors
 from jaxvm.discover.heldout import Split, hold_out, split
 from jaxvm.discover.hypotheses import enumerate_hypotheses, member
@@ -29,12 +30,6 @@ from jaxvm.network.start import start
 from jaxvm.recording import Recording
 from jaxvm.solve.adjust import Adjustment
 from jaxvm.solve.snooping import robust_variance
-
-ROOM = (16, 8)
-"""Columns and constants kept free for effects: the diagnosis' compiled programs are used again."""
-
-REPETITIONS = 199
-"""Like the diagnosis' null distribution, for the same reason; it is not asked for here."""
 
 ROLL_DEG = 10.0
 
@@ -207,7 +202,7 @@ def _power(
     # Remembering noise makes effect and gaps count less, by one factor.
     spread = inflation(scene, left[:n_pixels], noise)
     variance = variance * spread
-    still = np.zeros((len(scene.recording.time), REPETITIONS))
+    still = np.zeros((len(scene.recording.time), FLIPS))
     alike = score_residuals(scene, arrangement, asked, variance, still, residual=e)
     drops, evidence = best_by_name(alike, scene, variance, np.log(np.count_nonzero(e)))
     return Power(

@@ -41,8 +41,12 @@ from jaxvm.solve.snooping import robust_variance
 ALPHA = 0.01
 """Family-wise probability to claim something where nothing is hidden."""
 
-_ROOM = (16, 8)
-_FLIPS = 199
+ROOM = (16, 8)
+"""Columns and constants kept free for effects to be found."""
+
+FLIPS = 199
+"""Repetitions of the null distribution."""
+
 _ADVISED = 3
 
 
@@ -84,7 +88,7 @@ def diagnose(
     findings: list[Finding] = []
     hopeless: set = set()
     unproven, p_value, families = "", 1.0, enumerate_hypotheses(plain.scene)
-    signs = multipliers(len(parts.held), 1, _FLIPS, seed)
+    signs = multipliers(len(parts.held), 1, FLIPS, seed)
     asked = None
     while True:
         progress(f"scoring hypotheses (round {len(findings) + 1})")
@@ -261,7 +265,7 @@ def _confirmed(
         return [replace(f, p_value=f.p_independent) for f in findings]
     n_epochs = len(scene.recording.time)
     window = min(2 * window, max(int(LONGEST * n_epochs), 2))
-    remembering = multipliers(n_epochs, window, _FLIPS, seed)
+    remembering = multipliers(n_epochs, window, FLIPS, seed)
     left = score_residuals(
         scene,
         arrangement,
@@ -288,7 +292,7 @@ def _only_confirmed(
 def _room(effects: tuple[Effect, ...]) -> tuple[int, int]:
     """Room for the effects given and those to be found; the same for few of them."""
     columns, constants = capacity(effects)
-    return max(_ROOM[0], columns + 8), max(_ROOM[1], constants + 3)
+    return max(ROOM[0], columns + 8), max(ROOM[1], constants + 3)
 
 
 def _with_best_instants(final: Adjustment, weights) -> Adjustment:
