@@ -7,24 +7,19 @@ any effect and its scope are constant.
 from dataclasses import dataclass
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from jaxvm.network.binding import observation_driver_table, range_driver_table
-from jaxvm.network.factors import PixelFactor, RangeFactor, rounded
-from jaxvm.network.residual import port_jacobian, whitening
+from jaxvm.network.factors import PixelFactor, RangeFactor
 from jaxvm.solve.adjust import Adjustment
 from jaxvm.solve.arrow import Arrow, factorise
 from jaxvm.solve.problem import Problem, normal_at
 from jaxvm.solve.reduced import half_rows, packet_of_rows
 
-_HALVES = 16
-"""Half rows are filled up to a multiple of this: another lens is no other scoring program."""
 
-
-class Cells(eqx.Module):
+@dataclass(frozen=True)
+class Cells:
     """Residuals and tangents of a fitted scene, arranged in cells.
 
     Attributes:
@@ -36,18 +31,18 @@ class Cells(eqx.Module):
         epoch: cells of each epoch, padded with the number of cells.
     """
 
-    tangent: Float[Array, "ports cells rows"]
-    residual: Float[Array, "cells rows"]
-    half: Float[Array, "cells rows halves"]
-    group: Int[Array, "groups width"]
-    group_of: Int[Array, " cells"]
-    epoch: Int[Array, "epochs wide"]
-    n_local: int = eqx.field(static=True)
+    tangent: Float[np.ndarray, "ports cells rows"]
+    residual: Float[np.ndarray, "cells rows"]
+    half: Float[np.ndarray, "cells rows halves"]
+    group: Int[np.ndarray, "groups width"]
+    group_of: Int[np.ndarray, " cells"]
+    epoch: Int[np.ndarray, "epochs wide"]
+    n_local: int
 
-    def by(self, index: Int[Array, "a b"], values: Float[Array, "... cells"]):
+    def by(self, index: Int[np.ndarray, "a b"], values: Float[np.ndarray, "... cells"]):
         """Values of cells gathered by group or epoch; padding reads zero."""
-        zero = jnp.zeros((*values.shape[:-1], 1))
-        return jnp.concatenate([values, zero], axis=-1)[..., index]
+        zero = np.zeros((*values.shape[:-1], 1))
+        return np.concatenate([values, zero], axis=-1)[..., index]
 
 
 @dataclass(frozen=True)
@@ -62,22 +57,22 @@ class Arrangement:
     components: int
 
 
-@eqx.filter_jit
 def _whitened(problem: Problem, x, hessian: Arrow):
     """Half rows, residuals and port tangents of all tables on which effects act."""
-    factors = factorise(hessian)
-    flat = problem.flat(x)
-    state = problem.network.layout.restore(flat)
-    residuals = jax.tree.leaves(problem.residual(x))
-    result = []
+    tables = problem.linearised(x, tangent=True)
     n_effect = len(problem.network.pixels) + (problem.network.ranges is not None)
-    tables = list(zip(problem.network.factors(), problem.packets, residuals, strict=True))
-    for factor, packets, r in tables[:n_effect]:
-        assert isinstance(factor, PixelFactor | RangeFactor)
-        half = half_rows(factors, packets, problem.jacobian(factor, packets, flat), problem.sizes)
-        tangent = port_jacobian(factor, problem.network, state) * whitening(factor)[:, :, None]
-        result.append((half, r, tangent))
-    return result
+    jacobians = [table.jacobian for table in tables[:n_effect]]
+    halves = _half_rows(hessian, problem.packets[:n_effect], jacobians, problem.sizes)
+    return [
+        (half, table.value, table.tangent)
+        for half, table in zip(halves, tables[:n_effect], strict=True)
+    ]
+
+
+@eqx.filter_jit
+def _half_rows(hessian: Arrow, packets, jacobians, sizes):
+    factors = factorise(hessian)
+    return [half_rows(factors, p, j, sizes) for p, j in zip(packets, jacobians, strict=True)]
 
 
 def arrange(adjustment: Adjustment) -> Arrangement:
@@ -110,15 +105,11 @@ def arrange(adjustment: Adjustment) -> Arrangement:
             drivers.append(np.asarray(range_driver_table(scene, factor))[:n])
         keys.append(np.stack([group, np.asarray(factor.epoch)[:n], entity], axis=1))
         pad = [(0, 0), (0, components - r.shape[1])]
-        wider = -half.shape[2] % _HALVES
-        halves.append(np.pad(np.asarray(half)[:n], [*pad, (0, wider)]))
+        halves.append(np.pad(np.asarray(half)[:n], [*pad, (0, 0)]))
         residuals.append(np.pad(np.asarray(r)[:n], pad))
         tangents.append(np.pad(np.asarray(tangent)[:n], [*pad, (0, 0)]))
     key = np.concatenate(keys)
     distinct, cell = np.unique(key, axis=0, return_inverse=True)
-    # The number of cells is rounded up: empty cells of no group and no epoch carry nothing.
-    spare = np.full((rounded(len(distinct)) - len(distinct), 3), -1)
-    distinct = np.concatenate([distinct, spare])
     rows = _padded_lists(cell.ravel(), len(distinct), len(key))
 
     def in_cells(parts):
@@ -127,18 +118,18 @@ def arrange(adjustment: Adjustment) -> Arrangement:
         return values.reshape(len(distinct), rows.shape[1] * components, *values.shape[3:])
 
     cells = Cells(
-        tangent=jnp.asarray(np.moveaxis(in_cells(tangents), 2, 0)),
-        residual=jnp.asarray(in_cells(residuals)),
-        half=jnp.asarray(in_cells(halves)),
-        group=jnp.asarray(_padded_lists(distinct[:, 0], n_groups, len(distinct))),
-        group_of=jnp.asarray(np.where(distinct[:, 0] < 0, n_groups, distinct[:, 0])),
-        epoch=jnp.asarray(_padded_lists(distinct[:, 1], len(scene.recording.time), len(distinct))),
+        tangent=(np.moveaxis(in_cells(tangents), 2, 0)),
+        residual=(in_cells(residuals)),
+        half=(in_cells(halves)),
+        group=(_padded_lists(distinct[:, 0], n_groups, len(distinct))),
+        group_of=(np.where(distinct[:, 0] < 0, n_groups, distinct[:, 0])),
+        epoch=(_padded_lists(distinct[:, 1], len(scene.recording.time), len(distinct))),
         n_local=problem.sizes[2],
     )
     return Arrangement(
         cells,
         rows,
-        np.maximum(distinct[:, 1], 0),
+        distinct[:, 1],
         np.concatenate(drivers),
         tuple(starts),
         components,
@@ -149,7 +140,7 @@ def _padded_lists(label: np.ndarray, n_labels: int, filler: int) -> np.ndarray:
     """Positions of each label 0..n-1 as rows of equal length, filled up with `filler`."""
     kept = np.flatnonzero(label >= 0)
     counts = np.bincount(label[kept], minlength=n_labels)
-    lists = np.full((n_labels, rounded(max(int(counts.max(initial=0)), 1))), filler)
+    lists = np.full((n_labels, max(int(counts.max(initial=0)), 1)), filler)
     order = kept[np.argsort(label[kept], kind="stable")]
     first = np.concatenate([[0], np.cumsum(counts)])[:-1]
     lists[label[order], np.arange(len(order)) - first[label[order]]] = order

@@ -18,23 +18,24 @@ independence inside an epoch (wild bootstrap of the scores).
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxvm.discover.cells import Arrangement, Cells
 from jaxvm.discover.hypotheses import Family, Hypothesis, member
 from jaxvm.network.binding import in_scope, ranges_in_scope
-from jaxvm.network.factors import rounded
 from jaxvm.network.scene import Scene
+from jaxvm.physics.blocks import by_blocks, continued, roomy
 from jaxvm.physics.drivers import pattern
-from jaxvm.physics.effects import Scope
+from jaxvm.physics.effects import Scope, at_epochs
 from jaxvm.physics.forms import BASIS_INDEX, FORMS, evaluate_basis
 from jaxvm.physics.ports import PORT_INDEX
+
+_ABSORBED = 1e-8
 
 FEWEST_EPOCHS = 3.0
 """A hypothesis that fewer epochs carry than this can't be told from a few bad images."""
@@ -135,39 +136,26 @@ def score_residuals(
     if residual is not None:
         padded = np.concatenate([residual, np.zeros((1, arrangement.components))])
         own = padded[arrangement.rows].reshape(cells.residual.shape)
-        cells = eqx.tree_at(lambda c: c.residual, cells, jnp.asarray(own))
+        cells = replace(cells, residual=own)
+    common = _common(cells)
     results, null = [], np.full(signs.shape[1], -np.inf)
     for family, weights, used in zip(battery.families, battery.weights, battery.used, strict=True):
         ports, patterns = _group_arrays(scene, arrangement, family)
         valid = family.valid.reshape(len(family.groups), -1)[:, used]
-        n_groups, n_pairs = valid.shape
-        # Rounded sizes: a driver more or a mark less is no other program.
-        more, wider = rounded(n_groups) - n_groups, rounded(n_pairs) - n_pairs
-        ports, patterns, valid = (_grown(a, more) for a in (ports, patterns, valid))
-        valid = np.pad(valid, [(0, 0), (0, wider)])
-        drop, z, amplitude, seen, sound, largest = _kernel(
-            cells,
-            jnp.asarray(ports),
-            jnp.asarray(patterns),
-            jnp.asarray(_grown(weights, wider)),
-            jnp.asarray(valid),
-            jnp.asarray(signs),
-            jnp.asarray(variance),
-        )
-        null = np.maximum(null, np.asarray(largest))
+        pairs = _Pairs.of(weights, cells)
+        scored = []
+        for own in zip(ports, patterns, valid, strict=True):
+            *found, largest = _score_group(common, *own[:2], pairs, own[2], signs, variance)
+            null = np.maximum(null, largest)
+            scored.append(found)
         drop, z, amplitude, seen, sound = (
-            _spread(np.asarray(values)[:n_groups, :n_pairs], used, family.valid.shape, fill)
-            for values, fill in (
-                (drop, 0.0), (z, -np.inf), (amplitude, 0.0), (seen, 0.0), (sound, False),
+            _spread(np.stack(values), used, family.valid.shape, fill)
+            for values, fill in zip(
+                zip(*scored, strict=True), (0.0, -np.inf, 0.0, 0.0, False), strict=True
             )
-        )  # fmt: skip
+        )
         results.append(Scores(family, drop, z, amplitude, seen, sound, variance))
     return Ranking(tuple(results), null)
-
-
-def _grown(values: np.ndarray, more: int) -> np.ndarray:
-    """An array with some rows of zeros behind."""
-    return np.concatenate([values, np.zeros((more, *values.shape[1:]), values.dtype)])
 
 
 def _spread(values: np.ndarray, used: np.ndarray, shape: tuple[int, ...], fill) -> np.ndarray:
@@ -239,111 +227,135 @@ def course_tables(scene: Scene, families: tuple[Family, ...]) -> list[np.ndarray
                     constants.append((*course.constants, 1.0, 1.0)[:2])
                 own.append(place[key])
         index.append(np.array(own).reshape(len(family.courses), family.n_bases))
-    more = rounded(len(x)) - len(x)
-    rows = (_grown(np.array(v), more) for v in (basis, x, constants))
-    table = np.asarray(_evaluate(channels, *map(jnp.asarray, rows)))
+    grid = (continued(channels.time), roomy(channels.epoch_time))
+    rows = (np.array(basis), continued(np.array(x)), np.array(constants))
+    table = by_blocks(_evaluate, rows, *grid)[:, : len(channels.epoch_time)]
     return [table[own] for own in index]
 
 
-@eqx.filter_jit
-def _evaluate(channels, basis, x, constants):
-    on_grid = jax.lax.map(
-        lambda v: evaluate_basis(v[0], v[1], channels.time, v[2]),
-        (basis, x, constants),
-        batch_size=64,
-    )
-    return channels.at_epochs(on_grid)
+@jax.jit
+def _evaluate(rows, time, epoch_time):
+    evaluate = jax.vmap(lambda b, x, c: evaluate_basis(b, x, time, c))
+    return at_epochs(evaluate(*rows), time, epoch_time)
 
 
-@eqx.filter_jit
-def _kernel(
-    cells: Cells,
-    ports: Int[Array, "groups terms"],
-    patterns: Float[Array, "groups terms cells observations"],
-    weights: Float[Array, "b bases cells"],
-    valid: Bool[Array, "groups b"],
-    signs: Float[Array, "epochs repetitions"],
-    variance: Float[Array, ""],
-):
-    """Drop, z, amplitudes, visible share, soundness [groups, b, ...], largest z per repetition."""
-    d = cells.n_local
-    b, n_bases, _ = weights.shape
-    columns = ports.shape[1] * n_bases
-    by_group = cells.by(cells.group, weights)  # b i G w
-    by_epoch = cells.by(cells.epoch, weights)  # b i E w
-    zero = jnp.zeros((1, *cells.half.shape[1:]))
-    padded_half = jnp.concatenate([cells.half[:, :, d:], zero[:, :, d:]])
+@dataclass(frozen=True)
+class _Common:
+    """What all families share of one fit."""
+
+    cells: Cells
+    residual: Float[np.ndarray, "cells rows"]  # without what the local unknowns explain
+    pull: Float[np.ndarray, "epochs shared"]  # of each epoch on the shared unknowns
+    n_fitted: float  # epochs with residuals
+
+
+def _common(cells: Cells) -> _Common:
     residual = _without_local(cells)
-    padded_residual = jnp.concatenate([residual, jnp.zeros((1, residual.shape[1]))])
-    touched = jnp.sum(cells.by(cells.epoch, jnp.sum(cells.residual**2, axis=1)), axis=1) > 0.0
-    n_fitted = jnp.maximum(jnp.sum(touched), 2.0)
-    asked = jnp.any(signs != 0.0)  # all zero: the null distribution is not wanted
-    # What each epoch contributes to the gradient of the shared unknowns.
-    pull = jnp.einsum("ewr,ewrs->es", padded_residual[cells.epoch], padded_half[cells.epoch])
+    half = cells.half[:, :, cells.n_local :]
+    by_cell = np.einsum("nr,nrs->sn", residual, half, optimize=True)
+    touched = cells.by(cells.epoch, np.sum(cells.residual**2, axis=1)).sum(axis=1) > 0.0
+    pull = cells.by(cells.epoch, by_cell).sum(axis=2).T
+    return _Common(cells, residual, pull, max(float(touched.sum()), 2.0))
 
-    def one(inputs):
-        port, own_pattern, own_valid = inputs
-        components = cells.residual.shape[1] // own_pattern.shape[2]
-        tangent = cells.tangent[port] * jnp.repeat(own_pattern, components, axis=2)  # k n r
-        square = jnp.einsum("knr,lnr->nkl", tangent, tangent)
-        product = jnp.einsum("knr,nr->kn", tangent, residual)
-        halves = jnp.einsum("knr,nrs->nks", tangent, cells.half)
-        scaled_weights = jnp.einsum("bin,nkl->bkiln", weights, square)
-        gram = jnp.einsum("bkiln,bjn->bkilj", scaled_weights, weights)
-        gram = jnp.reshape(gram, (b, columns, columns))
-        shared = jnp.einsum("bin,nks->bkis", weights, halves[:, :, d:])
-        shared = jnp.reshape(shared, (b, columns, -1))
-        absorbed = jnp.einsum("bcs,bds->bcd", shared, shared)
-        if d:
-            local_halves = jnp.moveaxis(halves[:, :, :d], 0, -1)  # k s n
-            of_group = cells.by(cells.group, local_halves)  # k s G w
-            local = jnp.einsum("bigw,ksgw->gbkis", by_group, of_group)
-            local = jnp.reshape(local, (local.shape[0], b, columns, d))
-            absorbed = absorbed + jnp.einsum("gbcs,gbds->bcd", local, local)
-        information = gram - absorbed
-        of_epoch = cells.by(cells.epoch, product)  # k E w
-        parts = jnp.einsum("biew,kew->bkie", by_epoch, of_epoch)
-        parts = jnp.reshape(parts, (b, columns, -1)) - jnp.einsum("bcs,es->bce", shared, pull)
 
-        # Directions that the model absorbs to eight digits carry no information.
-        size = jnp.diagonal(gram, axis1=1, axis2=2)
-        unit = 1.0 / jnp.sqrt(jnp.where(size > 0.0, size, 1.0))
-        scaled = information * unit[:, :, None] * unit[:, None, :]
-        root = jnp.linalg.cholesky(scaled + 1e-8 * jnp.eye(columns))
-        whiten = jax.vmap(lambda m, v: jax.scipy.linalg.solve_triangular(m, v, lower=True))
-        part_w = whiten(root, parts * unit[:, :, None])  # b c e
-        score_w = jnp.sum(part_w, axis=2)
-        drop = jnp.sum(score_w**2, axis=1)
-        back = jax.vmap(lambda m, v: jax.scipy.linalg.solve_triangular(m, v, lower=True, trans=1))(
-            root, score_w
-        )
-        amplitude = -back * unit
+@dataclass(frozen=True)
+class _Pairs:
+    """Courses and scopes of a family over the cells: their weights, as the products need them."""
+
+    weights: Float[np.ndarray, "b bases cells"]
+    by_group: Float[np.ndarray, "groups b_bases width"]
+    by_epoch: Float[np.ndarray, "epochs b_bases wide"]
+
+    @classmethod
+    def of(cls, weights: np.ndarray, cells: Cells) -> "_Pairs":
+        """Gathered by group and by epoch."""
+        flat = weights.reshape(-1, weights.shape[2])
+        by_group = np.moveaxis(cells.by(cells.group, flat), 1, 0)
+        return cls(weights, by_group, np.moveaxis(cells.by(cells.epoch, flat), 1, 0))
+
+
+def _score_group(
+    common: _Common,
+    ports: Int[np.ndarray, " terms"],
+    patterns: Float[np.ndarray, "terms cells observations"],
+    pairs: _Pairs,
+    valid: Bool[np.ndarray, " b"],
+    signs: Float[np.ndarray, "epochs repetitions"],
+    variance: float,
+):
+    """Drop, z, amplitudes, visible share, soundness [b, ...], and the largest z per repetition.
+
+    Few large matrix products, in NumPy: a compiled program for every shape of a family would take
+    longer to make than to run.
+    """
+    cells, weights = common.cells, pairs.weights
+    d = cells.n_local
+    b, n_bases, n = weights.shape
+    k = len(ports)
+    columns = k * n_bases
+    components = cells.residual.shape[1] // patterns.shape[2]
+    tangent = cells.tangent[ports] * np.repeat(patterns, components, axis=2)  # k n r
+    tangent = np.ascontiguousarray(np.moveaxis(tangent, 1, 0))  # n k r
+    square = tangent @ np.swapaxes(tangent, 1, 2)  # n k k
+    product = (tangent @ common.residual[:, :, None])[:, :, 0]  # n k
+    halves = tangent @ cells.half  # n k s
+    of_bases = weights.reshape(b * n_bases, n)
+
+    def by_terms(values: np.ndarray) -> np.ndarray:
+        """[b bases, terms, ...] with one axis of columns, term by term."""
+        split = values.reshape(b, n_bases, k, *values.shape[2:])
+        return np.swapaxes(split, 1, 2).reshape(b, columns, *values.shape[2:])
+
+    if n_bases == 1:
+        gram = ((of_bases**2) @ square.reshape(n, k * k)).reshape(b, k, k)
+    else:
+        gram = np.empty((b, k, n_bases, k, n_bases))
+        for i in range(k):
+            for j in range(k):
+                gram[:, i, :, j] = (weights * square[:, i, j]) @ np.swapaxes(weights, 1, 2)
+        gram = gram.reshape(b, columns, columns)
+    of_shared = halves[:, :, d:]
+    shared = by_terms((of_bases @ of_shared.reshape(n, -1)).reshape(-1, *of_shared.shape[1:]))
+    information = gram - shared @ np.swapaxes(shared, 1, 2)
+    if d:
+        padded = np.concatenate([halves[:, :, :d], np.zeros((1, k, d))])[cells.group]
+        local = pairs.by_group @ padded.reshape(*cells.group.shape, k * d)  # G (b i) (k d)
+        local = np.moveaxis(local, 0, 1).reshape(b * n_bases, -1, k, d)
+        local = by_terms(np.swapaxes(local, 1, 2)).reshape(b, columns, -1)
+        information -= local @ np.swapaxes(local, 1, 2)
+    padded = np.concatenate([product, np.zeros((1, k))])[cells.epoch]  # E w k
+    parts = by_terms(np.moveaxis(pairs.by_epoch @ padded, 0, 2))  # b c E
+    parts = parts - shared @ common.pull.T
+
+    # Directions that the model absorbs to eight digits carry no information.
+    size = np.diagonal(gram, axis1=1, axis2=2)
+    unit = 1.0 / np.sqrt(np.where(size > 0.0, size, 1.0))
+    scaled = information * unit[:, :, None] * unit[:, None, :]
+    root = np.linalg.cholesky(scaled + _ABSORBED * np.eye(columns))
+    inverse = np.linalg.inv(root)
+    part_w = inverse @ (parts * unit[:, :, None])  # b c E
+    score_w = part_w.sum(axis=2)
+    drop = np.sum(score_w**2, axis=1)
+    amplitude = -np.einsum("bdc,bd->bc", inverse, score_w) * unit
+    seen = np.diagonal(scaled, axis1=1, axis2=2).max(axis=1)
+    of_epoch_square = cells.by(cells.epoch, np.einsum("nkk->n", square))  # E w
+    weight_square = np.einsum("ebw,ew->be", pairs.by_epoch**2, of_epoch_square, optimize=True)
+    weight_square = weight_square.reshape(b, n_bases, -1).sum(axis=1)
+    total = weight_square.sum(axis=1)
+    carried = total**2 / np.maximum(np.sum(weight_square**2, axis=1), 1e-300)
+    fewest = min(FEWEST_EPOCHS, 0.5 * len(cells.epoch))
+    sound = valid & (seen > 1e-6) & (total > 0.0) & (carried >= fewest)
+    z = np.where(sound, surprise(drop / variance, columns), -np.inf)
+    largest = np.full(signs.shape[1], -np.inf)
+    if signs.any() and sound.any():  # all zero: the null distribution is not wanted
         # A fitted residual lacks what the shared unknowns take of its epoch, about 1/epochs.
-        lost = jnp.maximum(1.0 - 1.0 / n_fitted, 0.5)
-        flipped = jax.lax.cond(
-            asked,
-            lambda: jnp.einsum("bce,er->bcr", part_w, signs) / jnp.sqrt(lost),
-            lambda: jnp.zeros((b, columns, signs.shape[1])),
-        )
-        null_drop = jnp.sum(flipped**2, axis=1)
-
-        seen = jnp.max(jnp.diagonal(scaled, axis1=1, axis2=2), axis=1)
-        of_epoch_square = cells.by(cells.epoch, jnp.einsum("nkk->n", square))  # E w
-        weight_square = jnp.einsum("biew,ew->be", by_epoch**2, of_epoch_square)
-        total = jnp.sum(weight_square, axis=1)
-        carried = total**2 / jnp.maximum(jnp.sum(weight_square**2, axis=1), 1e-300)
-        fewest = min(FEWEST_EPOCHS, 0.5 * cells.epoch.shape[0])
-        sound = own_valid & (seen > 1e-6) & (total > 0.0) & (carried >= fewest)
-        z = surprise(drop / variance, columns)
-        null_z = surprise(null_drop / variance, columns)
-        largest = jnp.max(jnp.where(sound[:, None], null_z, -jnp.inf), axis=0, initial=-jnp.inf)
-        return drop, jnp.where(sound, z, -jnp.inf), amplitude, seen, sound, largest
-
-    drop, z, amplitude, seen, sound, largest = jax.lax.map(one, (ports, patterns, valid))
-    return drop, z, amplitude, seen, sound, jnp.max(largest, axis=0)
+        lost = max(1.0 - 1.0 / common.n_fitted, 0.5)
+        null = np.sum((part_w[sound] @ signs) ** 2, axis=1).max(axis=0) / lost
+        largest = surprise(null / variance, columns)
+    return drop, z, amplitude, seen, sound, largest
 
 
-def _without_local(cells: Cells) -> Float[Array, "cells rows"]:
+def _without_local(cells: Cells) -> Float[np.ndarray, "cells rows"]:
     """Residuals without the part that the local unknowns explain.
 
     At the minimum there is none; another vector may have one. The local columns of the half rows
@@ -352,20 +364,21 @@ def _without_local(cells: Cells) -> Float[Array, "cells rows"]:
     d = cells.n_local
     if not d:
         return cells.residual
-    own = jnp.einsum("nr,nrd->dn", cells.residual, cells.half[:, :, :d])
-    of_group = jnp.sum(cells.by(cells.group, own), axis=2)  # d G
-    back = jnp.concatenate([of_group, jnp.zeros((d, 1))], axis=1)[:, cells.group_of]
-    return cells.residual - jnp.einsum("dn,nrd->nr", back, cells.half[:, :, :d])
+    half = cells.half[:, :, :d]
+    own = np.einsum("nr,nrd->dn", cells.residual, half)
+    of_group = cells.by(cells.group, own).sum(axis=2)  # d G
+    back = np.concatenate([of_group, np.zeros((d, 1))], axis=1)[:, cells.group_of]
+    return cells.residual - np.einsum("dn,nrd->nr", back, half)
 
 
-def surprise(chi_square: Float[Array, "..."], columns: int) -> Float[Array, "..."]:
+def surprise(chi_square: Float[np.ndarray, "..."], columns: int) -> Float[np.ndarray, "..."]:
     """About -2 ln p of a chi-square statistic: comparable whatever the number of columns.
 
     The leading term of the upper tail, p ~ x^(s-1) e^-x / Gamma(s) with s = columns/2, x = half the
     statistic; below the mean, where it does not hold, the statistic is taken at the mean.
     """
-    x = 0.5 * jnp.maximum(chi_square, columns)
-    return 2.0 * (x - (0.5 * columns - 1.0) * jnp.log(x) + math.lgamma(0.5 * columns))
+    x = 0.5 * np.maximum(chi_square, columns)
+    return 2.0 * (x - (0.5 * columns - 1.0) * np.log(x) + math.lgamma(0.5 * columns))
 
 
 def top(ranking: Ranking, scene: Scene, count: int) -> list[tuple[Hypothesis, float, np.ndarray]]:

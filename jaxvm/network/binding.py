@@ -9,10 +9,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from jaxvm.network.factors import PixelFactor, PriorFactor, RangeFactor
 from jaxvm.network.residual import Network, parts_of
 from jaxvm.network.tables import Tables
+from jaxvm.physics.blocks import by_blocks, roomy
 from jaxvm.physics.chain import Aim, Sight
 from jaxvm.physics.drivers import all_observation_drivers, all_range_drivers, pattern
 from jaxvm.physics.effects import Effect, Scope, courses
@@ -71,7 +73,7 @@ def _with_amplitude_priors(scene: Scene, network: Network) -> Network:
     tables = [*network.pixels, *([] if network.ranges is None else [network.ranges])]
     for factor in tables:
         reach = np.maximum(reach, np.abs(np.asarray(factor.pattern)).max(axis=0, initial=0.0))
-    own = np.asarray(_courses(network.effects, scene.state.constant, network.channels))
+    own = np.asarray(courses(network.effects, scene.state.constant, network.channels))
     reach = reach * np.abs(own).max(axis=1)
     largest = np.abs(np.asarray(network.effects.ports)).T > 0
     limit = np.where(largest, np.array([port.largest for port in PORTS])[:, None], 0.0).max(axis=0)
@@ -90,20 +92,18 @@ def _with_amplitude_priors(scene: Scene, network: Network) -> Network:
     return replace(network, priors=both)
 
 
-_courses = eqx.filter_jit(courses)
-
-
 def observation_driver_table(scene: Scene, factor: PixelFactor, rows: np.ndarray):
     """Observation-like drivers of a pixel table at the scene's present state."""
     sizes = np.array([c.image_size for c in scene.model.cameras], float)
     padded = np.append(rows, np.full(factor.slots.shape[0] - len(rows), rows[-1]))
-    size = jnp.asarray(sizes[scene.recording.observations.camera[padded]])
+    size = sizes[scene.recording.observations.camera[padded]]
     up = jnp.asarray(scene.model.up, float)
-    return _driver_table(factor, scene.state.flatten(), size, up)
+    return by_blocks(_driver_table, (factor, size), roomy(scene.state.flatten()), up)
 
 
 @eqx.filter_jit
-def _driver_table(factor: PixelFactor, flat, size, up):
+def _driver_table(table: tuple[PixelFactor, Array], flat, up):
+    factor, size = table
     own = parts_of(factor, flat)
     plain = jax.vmap(lambda o, at: factor.local(o, at, PortValues()) + at.pixel)
     predicted = plain(own, factor.circumstances)
@@ -112,7 +112,7 @@ def _driver_table(factor: PixelFactor, flat, size, up):
 
 def range_driver_table(scene: Scene, factor: RangeFactor):
     """Observation-like drivers of the distances at the scene's present state."""
-    return _range_driver_table(factor, scene.state.flatten())
+    return by_blocks(_range_driver_table, factor, roomy(scene.state.flatten()))
 
 
 @eqx.filter_jit

@@ -6,7 +6,6 @@ after the other; the block Jacobian comes from the same local functions (`jaxvm.
 """
 
 import abc
-from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -25,27 +24,6 @@ def rounded(n: int) -> int:
     """
     step = 1 << max(int(n - 1).bit_length() - 3, 0)
     return -(-n // step) * step
-
-
-class Course(NamedTuple):
-    """What one observation needs of the effects: their patterns and their courses at its epoch."""
-
-    pattern: Float[Array, " columns"]
-    value: Float[Array, " columns"]
-
-
-class Row(NamedTuple):
-    """The values at an observation's slots: its own parameters, part by part, and amplitudes."""
-
-    own: tuple[Float[Array, " part"], ...]
-    amplitude: Float[Array, " columns"]
-
-
-def port_values(
-    row: Row, course: Course, ports: Float[Array, "columns ports"]
-) -> Float[Array, " ports"]:
-    """Port values of one observation: what all effects together do to it."""
-    return (row.amplitude * course.value * course.pattern) @ ports
 
 
 class Factor(eqx.Module):

@@ -3,6 +3,7 @@
 Simulation, adjustment, covariance, Monte Carlo and diagnosis all call what stands here.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -13,18 +14,16 @@ from jaxtyping import Array, Float
 
 from jaxvm.network.factors import (
     ClosureFactor,
-    Course,
     EdgeFactor,
     Factor,
     LinkFactor,
     PixelFactor,
     PriorFactor,
     RangeFactor,
-    Row,
-    port_values,
 )
 from jaxvm.network.state import Layout, State
-from jaxvm.physics.effects import Channels, EffectTable, course_slopes, courses
+from jaxvm.physics.blocks import by_blocks, roomy
+from jaxvm.physics.effects import Channels, EffectTable, courses
 from jaxvm.physics.ports import N_PORTS, PortValues
 
 
@@ -66,11 +65,11 @@ class Residuals(NamedTuple):
     priors: Float[Array, "observations 1"] | None
 
 
-@eqx.filter_jit
 def residual(state: State, network: Network) -> Residuals:
     """Whitened residuals of all observations: the one function of the project.
 
-    Pure and differentiable in every field of `state`; `jax.vmap` and `jax.jit` apply.
+    Pure and differentiable in every field of `state`; `jax.vmap` and `jax.jit` apply. Called
+    outside of them it is computed in compiled blocks (`jaxvm.physics.blocks`).
     """
     flat = state.flatten()
     values = courses(network.effects, state.constant, network.channels)
@@ -102,22 +101,21 @@ def rows(
     values: Float[Array, "columns epochs"],
 ) -> Float[Array, "observations components"]:
     """Predicted minus measured of one table, in its unit."""
-    course = _course(factor, network, values)
-    return jax.vmap(lambda row, at, data: _local(factor, network, row, at, data))(
-        _gather(factor, network, flat), course, factor.data()
-    )
+    amplitude = flat[jnp.asarray(network.layout.all("amplitude"))]
+    acting = Acting(amplitude, network.effects.ports, values)
+    return by_blocks(_rows, factor, roomy(flat), acting.roomy())
 
 
-def _affected(factor: Factor, network: Network) -> bool:
-    """Whether effects act on a table."""
-    return isinstance(factor, PixelFactor | RangeFactor) and network.effects.n_columns > 0
+class Acting(NamedTuple):
+    """What all observations share of the effects."""
 
+    amplitude: Float[Array, " columns"]
+    ports: Float[Array, "columns ports"]
+    value: Float[Array, "columns epochs"]
 
-def _course(factor, network, values) -> Course | None:
-    """Effects at the epochs of a table; None for tables on which they do not act."""
-    if not _affected(factor, network):
-        return None
-    return Course(factor.pattern, values.T[factor.epoch])
+    def roomy(self) -> "Acting":
+        """With spare epochs, so that a recording of another length is no other program."""
+        return self._replace(value=roomy(self.value, axis=1))
 
 
 def parts_of(factor: Factor, flat: Float[Array, " n"]) -> tuple[Float[Array, "n part"], ...]:
@@ -127,104 +125,100 @@ def parts_of(factor: Factor, flat: Float[Array, " n"]) -> tuple[Float[Array, "n 
     return tuple(flat[factor.slots[:, a:b]] for a, b in pieces)
 
 
-def _gather(factor: Factor, network: Network, flat) -> Row:
-    n = factor.slots.shape[0]
-    amplitude = flat[jnp.asarray(network.layout.all("amplitude"))]
-    return Row(parts_of(factor, flat), jnp.broadcast_to(amplitude, (n, amplitude.shape[0])))
+@eqx.filter_jit
+def _rows(factor: Factor, flat, acting: Acting) -> Float[Array, "observations components"]:
+    local = jax.vmap(lambda own, data, ports: factor.local(own, data, PortValues(ports)))
+    return local(parts_of(factor, flat), factor.data(), _ports(factor, acting))
 
 
-def _local(factor, network, row: Row, course: Course | None, data, disturbance=None):
-    ports = disturbance
-    if course is not None:
-        acting = port_values(row, course, network.effects.ports)
-        ports = acting if ports is None else acting + ports
-    return factor.local(row.own, data, PortValues(ports))
+def _ports(factor: Factor, acting: Acting) -> Float[Array, "observations ports"] | None:
+    """Port values of each observation: what all effects together do to it; None without effects."""
+    if not (isinstance(factor, PixelFactor | RangeFactor) and len(acting.amplitude)):
+        return None
+    course = acting.amplitude * acting.value.T[factor.epoch] * factor.pattern
+    return course @ acting.ports
+
+
+class Linearised(NamedTuple):
+    """A table at one state, in its unit."""
+
+    value: Float[Array, "observations components"]  # predicted minus measured
+    jacobian: Float[Array, "observations components live"]
+    tangent: Float[Array, "observations components ports"]  # by every port: tangents of all effects
+
+
+def linearise(
+    factor: Factor,
+    network: Network,
+    flat: Float[Array, " n"],
+    values: Float[Array, "columns epochs"],
+    slopes: Float[Array, "columns epochs 2"],
+    live: tuple[int, ...],
+    tangent: bool = False,
+) -> Linearised:
+    """Each row with its derivatives: by its live slots, and by the ports.
+
+    `live` are the positions along [own slots, amplitudes, constants] that are wanted. Reverse mode:
+    a row has one to six components and many slots. Whatever the number of effects, they enter
+    through the ports: one derivative by the ports serves all amplitudes and constants. Without any
+    the tangent is computed when it is asked for, else it is empty.
+    """
+    layout = network.layout
+    amplitude = flat[jnp.asarray(layout.all("amplitude"))]
+    acting = Acting(amplitude, network.effects.ports, values).roomy()
+    n_constants = len(layout.all("constant"))
+    owner = jax.nn.one_hot(network.effects.constant_index, n_constants, dtype=float)
+    common = (roomy(flat), acting, roomy(slopes, axis=1), owner)
+    return by_blocks(partial(_linearise, live=live, tangent=tangent), factor, *common)
 
 
 @eqx.filter_jit
-def block_jacobian(
-    factor: Factor, network: Network, flat: Float[Array, " n"], live: tuple[int, ...]
-) -> Float[Array, "observations components slots"]:
-    """Derivative of each row with respect to its slots: own slots, amplitudes, constants.
-
-    `live` are the positions along [own, amplitude, constant] that are wanted. Reverse mode: a row
-    has one to six components and many slots. Whatever the number of effects, they enter through the
-    ports: one derivative with respect to the ports serves all amplitudes and constants.
-    """
-    n, components = factor.slots.shape[0], factor.sigma.shape[1]
+def _linearise(factor: Factor, flat, acting: Acting, slopes, owner, live, tangent) -> Linearised:
     n_own = factor.slots.shape[1]
-    of_effects = [at for at in live if at >= n_own]
-    acting = _affected(factor, network) and bool(of_effects)
-    own, ports = _derivatives(factor, network, flat, [at for at in live if at < n_own], acting)
-    if not of_effects:
-        return own
-    if not (acting and isinstance(factor, PixelFactor | RangeFactor)):
-        return jnp.concatenate([own, jnp.zeros((n, components, len(of_effects)))], axis=2)
-    effects, layout = network.effects, network.layout
-    constant = flat[jnp.asarray(layout.all("constant"))]
-    amplitude = flat[jnp.asarray(layout.all("amplitude"))]
-    values = courses(effects, constant, network.channels).T[factor.epoch]
-    slopes = jnp.moveaxis(course_slopes(effects, constant, network.channels), 1, 0)[factor.epoch]
-    entering = (ports @ effects.ports.T) * factor.pattern[:, None, :]
-    moved = (entering * amplitude)[..., None] * slopes[:, None]
-    owner = jax.nn.one_hot(effects.constant_index, constant.shape[0], dtype=moved.dtype)
-    by_constants = jnp.reshape(moved, (n, components, -1)) @ jnp.reshape(
-        owner, (-1, constant.shape[0])
-    )
-    every = jnp.concatenate([entering * values[:, None, :], by_constants], axis=2)
-    return jnp.concatenate([own, every[:, :, jnp.asarray(of_effects) - n_own]], axis=2)
+    own = [at for at in live if at < n_own]
+    of_effects = jnp.asarray([at - n_own for at in live if at >= n_own], int)
+    ports = _ports(factor, acting)
+    affected = ports is not None
+    if tangent and not affected and isinstance(factor, PixelFactor | RangeFactor):
+        ports = jnp.zeros((factor.slots.shape[0], N_PORTS))
+    value, by_own, by_ports = _derivatives(factor, parts_of(factor, flat), ports, own)
+    if not affected or not of_effects.size:
+        nothing = jnp.zeros((*value.shape, of_effects.size))
+        return Linearised(value, jnp.concatenate([by_own, nothing], axis=2), by_ports)
+    entering = (by_ports @ acting.ports.T) * factor.pattern[:, None, :]
+    slope = jnp.moveaxis(slopes, 1, 0)[factor.epoch]
+    moved = (entering * acting.amplitude)[..., None] * slope[:, None]
+    n_constants = owner.shape[2]
+    by_constants = jnp.reshape(moved, (*value.shape, -1)) @ jnp.reshape(owner, (-1, n_constants))
+    by_amplitudes = entering * acting.value.T[factor.epoch][:, None, :]
+    every = jnp.concatenate([by_amplitudes, by_constants], axis=2)[:, :, of_effects]
+    return Linearised(value, jnp.concatenate([by_own, every], axis=2), by_ports)
 
 
-def _derivatives(factor, network, flat, live: list[int], with_ports: bool):
-    """Derivatives of each row [n, components, ...]: by live slots of its own, and by all ports.
-
-    Without ports their part is empty.
-    """
-    row = _gather(factor, network, flat)
-    constant = flat[jnp.asarray(network.layout.all("constant"))]
-    course = None
-    if _affected(factor, network):
-        course = _course(factor, network, courses(network.effects, constant, network.channels))
-    ends = np.cumsum([part.shape[1] for part in row.own])
+def _derivatives(factor: Factor, parts, ports, live: list[int]):
+    """Values of the rows, and their derivatives by live slots of their own and by all ports."""
+    ends = np.cumsum([part.shape[1] for part in parts])
     first = np.concatenate([[0], ends])[:-1]
     # Only parameters with a wanted slot are differentiated; the others are constants.
     moving = [k for k in range(len(ends)) if any(first[k] <= at < ends[k] for at in live)]
     within = np.concatenate([np.arange(first[k], ends[k]) for k in moving] or [[]])
     wanted = jnp.asarray(np.searchsorted(within, np.asarray(live, int)), int)
 
-    def local(free, disturbance, row, at, data):
-        own = list(row.own)
+    def local(free, ports, parts, data):
+        own = list(parts)
         for k, value in zip(moving, free, strict=True):
             own[k] = value
-        return _local(factor, network, Row(tuple(own), row.amplitude), at, data, disturbance)
+        value = factor.local(own, data, PortValues(ports))
+        return value, value
 
-    none = jnp.zeros((factor.slots.shape[0], factor.sigma.shape[1], 0))
-    free = [row.own[k] for k in moving]
-    ports = none
-    if with_ports:
-        blocks, ports = jax.vmap(jax.jacrev(local, argnums=(0, 1)), in_axes=(0, None, 0, 0, 0))(
-            free, jnp.zeros(N_PORTS), row, course, factor.data()
-        )
-    elif not moving:
-        return none, none
-    else:
-        blocks = jax.vmap(jax.jacrev(lambda own, *rest: local(own, None, *rest)))(
-            free, row, course, factor.data()
-        )
-    return jnp.concatenate([none, *blocks], axis=2)[:, :, wanted], ports
+    free = [parts[k] for k in moving]
+    derivative = jax.vmap(jax.jacrev(local, argnums=(0, 1), has_aux=True))
+    (blocks, by_ports), value = derivative(free, ports, parts, factor.data())
+    none = jnp.zeros((*value.shape, 0))
+    by_own = jnp.concatenate([none, *blocks], axis=2)[:, :, wanted]
+    return value, by_own, none if by_ports is None else by_ports
 
 
-def port_jacobian(
-    factor: PixelFactor | RangeFactor, network: Network, state: State
-) -> Float[Array, "observations components ports"]:
-    """Derivative of each row with respect to every port, in its unit: the tangents of all effects.
-
-    One reverse pass for each component gives all ports at once.
-    """
-    return _derivatives(factor, network, state.flatten(), [], True)[1]
-
-
-@eqx.filter_jit
 def predict_pixels(state: State, network: Network) -> tuple[Float[Array, "observations 2"], ...]:
     """Predicted pixels (px) of every table: what a simulation adds its noise to."""
     flat = state.flatten()

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxvm.physics.blocks import continued, roomy
 from jaxvm.physics.forms import BASIS_INDEX, FORMS, Form, evaluate_basis
 from jaxvm.physics.ports import N_PORTS, PORT_INDEX
 
@@ -144,9 +145,10 @@ class Channels(eqx.Module):
         """Mean of a channel over the epochs, the reference of centred forms."""
         return float(np.mean(np.interp(self.epoch_time, self.time, self.values[self.index(name)])))
 
-    def at_epochs(self, courses: Float[Array, "n times"]) -> Float[Array, "n epochs"]:
-        """Courses on the grid, read at the epochs by linear interpolation."""
-        return jax.vmap(lambda y: jnp.interp(self.epoch_time, self.time, y))(courses)
+    def roomy(self):
+        """Values, times and times of epochs with spare room: other lengths are no other program."""
+        values, time = (continued(series) for series in (self.values, self.time))
+        return roomy(values, least=16), time, roomy(self.epoch_time)
 
 
 class EffectTable(eqx.Module):
@@ -223,25 +225,36 @@ def courses(
     table: EffectTable, constants: Float[Array, " constants"], channels: Channels
 ) -> Float[Array, "columns epochs"]:
     """Course of every column at the epochs. Differentiable in the constants."""
-    return channels.at_epochs(_on_grid(table, constants[table.constant_index], channels))
+    n = len(channels.epoch_time)
+    return _courses(table, constants[table.constant_index], *channels.roomy())[:, :n]
 
 
 def course_slopes(
     table: EffectTable, constants: Float[Array, " constants"], channels: Channels
 ) -> Float[Array, "columns epochs 2"]:
     """Derivative of every column's course with respect to its own two constants."""
-    own = constants[table.constant_index]
+    n = len(channels.epoch_time)
+    return _course_slopes(table, constants[table.constant_index], *channels.roomy())[:, :n]
 
+
+@jax.jit
+def _courses(table: EffectTable, own: Float[Array, "columns 2"], values, time, epoch_time):
+    x = values[table.channel] - table.reference[:, None]
+    on_grid = jax.vmap(lambda b, xi, c: evaluate_basis(b, xi, time, c))(table.basis, x, own)
+    return at_epochs(on_grid, time, epoch_time)
+
+
+@jax.jit
+def _course_slopes(table: EffectTable, own: Float[Array, "columns 2"], *grid):
     # One shift for all columns: a column depends on no constant but its own two.
-    def shifted(by: Float[Array, "2"]):
-        return channels.at_epochs(_on_grid(table, own + by, channels))
-
-    return jax.jacfwd(shifted)(jnp.zeros(2))
+    return jax.jacfwd(lambda by: _courses(table, own + by, *grid))(jnp.zeros(2))
 
 
-def _on_grid(table: EffectTable, own: Float[Array, "columns 2"], channels: Channels):
-    x = channels.values[table.channel] - table.reference[:, None]
-    return jax.vmap(lambda b, xi, c: evaluate_basis(b, xi, channels.time, c))(table.basis, x, own)
+def at_epochs(
+    courses: Float[Array, "n times"], time: Float[Array, " times"], epoch_time
+) -> Float[Array, "n epochs"]:
+    """Courses on the grid, read at the epochs by linear interpolation."""
+    return jax.vmap(lambda y: jnp.interp(epoch_time, time, y))(courses)
 
 
 def form_of(effect: Effect) -> Form:

@@ -12,10 +12,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxvm.network.factors import Factor, rounded
-from jaxvm.network.residual import Network, Residuals, block_jacobian, residual, whitening
+from jaxvm.network.residual import Linearised, Network, Residuals, linearise, residual
 from jaxvm.network.scene import Scene
 from jaxvm.network.state import Layout, State
 from jaxvm.network.unknowns import Unknowns
+from jaxvm.physics.effects import course_slopes, courses
 from jaxvm.solve.arrow import Arrow
 from jaxvm.solve.robust import Loss, SquaredLoss
 
@@ -112,8 +113,7 @@ class Problem(eqx.Module):
 
     def flat(self, x: Float[Array, " n"]) -> Float[Array, " parameters"]:
         """Flat state at x."""
-        moved = jnp.concatenate([jnp.where(self.active, x, 0.0), jnp.zeros(1)])
-        return self.base + self.factor * moved[self.column]
+        return _flat(self.base, self.factor, self.column, self.active, x)[0]
 
     def state(self, x: Float[Array, " n"]) -> State:
         """State at x."""
@@ -129,63 +129,96 @@ class Problem(eqx.Module):
         squares = [jnp.sum(self.loss.value(jnp.sum(block**2, axis=1))) for block in blocks]
         return 0.5 * jnp.sum(jnp.stack(squares))
 
-    def jacobian(self, factor: Factor, packets: Packets, flat) -> Float[Array, "obs comps live"]:
-        """Whitened block Jacobian of a table with respect to the unknowns of its live slots."""
-        effects = jnp.concatenate(
-            [
-                jnp.asarray(self.network.layout.all("amplitude")),
-                jnp.asarray(self.network.layout.all("constant")),
-            ]
-        )
-        n = factor.slots.shape[0]
-        slots = jnp.concatenate(
-            [factor.slots, jnp.broadcast_to(effects, (n, effects.shape[0]))], axis=1
-        )[:, jnp.asarray(packets.live, int)]
-        moving = jnp.concatenate([self.active, jnp.zeros(1, bool)])[self.column]
-        per_unknown = jnp.where(moving, self.factor, 0.0)[slots]
-        blocks = block_jacobian(factor, self.network, flat, packets.live)
-        return blocks * whitening(factor)[:, :, None] * per_unknown[:, None, :]
+    def linearised(self, x: Float[Array, " n"], tangent: bool = False) -> list[Linearised]:
+        """Every table at x, whitened, with derivatives by the unknowns of its live slots.
+
+        With `tangent` also by every port, where ports act on the table.
+        """
+        raw, whiten, steps = [], [], []
+        flat, per_parameter = _flat(self.base, self.factor, self.column, self.active, x)
+        network, layout = self.network, self.network.layout
+        constant = flat[layout.offset("constant") : layout.offset("identity")]
+        values = courses(network.effects, constant, network.channels)
+        slopes = course_slopes(network.effects, constant, network.channels)
+        effects = np.concatenate([layout.all("amplitude"), layout.all("constant")])
+        for factor, packets in zip(network.factors(), self.packets, strict=True):
+            raw.append(linearise(factor, network, flat, values, slopes, packets.live, tangent))
+            whiten.append((factor.weight, factor.sigma))
+            steps.append((factor.slots, jnp.asarray(effects), packets.live))
+        return _whitened(raw, whiten, steps, per_parameter)
 
     def normal(self, x: Float[Array, " n"]) -> Normal:
         """Cost, gradient and Gauss-Newton matrix, with the weights of the robust loss."""
-        flat = self.flat(x)
-        s, groups, d = self.sizes
-        cost = jnp.zeros(())
-        gradient = jnp.zeros(self.n + 1)
-        shared = jnp.zeros((s + 1, s + 1))
-        coupling = jnp.zeros((groups + 1, d + 1, s + 1))
-        local = jnp.zeros((groups + 1, d + 1, d + 1))
-        blocks = jax.tree.leaves(self.residual(x))
-        for factor, packets, r in zip(self.network.factors(), self.packets, blocks, strict=True):
-            square = jnp.sum(r**2, axis=1)
-            cost = cost + 0.5 * jnp.sum(self.loss.value(square))
-            root = jnp.sqrt(self.loss.weight(square))[:, None]
-            gram, product = packet_products(
-                packets, self.jacobian(factor, packets, flat) * root[:, :, None], r * root
-            )
-            place, group, member = split_columns(packets.columns, self.sizes)
-            # What a packet has to itself is scattered; what all have in common (effects) is summed
-            # first, for it is most of a wide model.
-            k = sum(at < factor.slots.shape[1] for at in packets.live)
-            common = place[0, k:]
-            place, member = place[:, :k], member[:, :k]
-            gradient = gradient.at[packets.columns[:, :k]].add(product[:, :k])
-            gradient = gradient.at[packets.columns[0, k:]].add(jnp.sum(product[:, k:], axis=0))
-            own, cross = gram[:, :k, :k], gram[:, :k, k:]
-            mixed = jnp.zeros((s + 1, common.shape[0])).at[place].add(cross)
-            shared = shared.at[place[:, :, None], place[:, None, :]].add(own)
-            shared = shared.at[:, common].add(mixed).at[common].add(mixed.T)
-            both = jnp.sum(gram[:, k:, k:], axis=0)
-            shared = shared.at[common[:, None], common].add(both)
-            if groups:
-                where = group[:, None, None]
-                coupling = coupling.at[where, member[:, :, None], place[:, None, :]].add(own)
-                apart = jnp.zeros((groups + 1, d + 1, common.shape[0]))
-                apart = apart.at[group[:, None], member].add(cross)
-                coupling = coupling.at[:, :, common].add(apart)
-                local = local.at[where, member[:, :, None], member[:, None, :]].add(own)
-        arrow = Arrow(shared[:s, :s], coupling[:groups, :d, :s], local[:groups, :d, :d])
-        return Normal(cost, gradient[: self.n], arrow)
+        own = [factor.slots.shape[1] for factor in self.network.factors()]
+        return _assembled(self.linearised(x), self.packets, own, self.loss, self.sizes)
+
+
+@jax.jit
+def _flat(base, factor, column, active, x):
+    """Flat state at x, and the change of every parameter for a unit change of its unknown."""
+    moved = jnp.concatenate([jnp.where(active, x, 0.0), jnp.zeros(1)])
+    moving = jnp.concatenate([active, jnp.zeros(1, bool)])[column]
+    return base + factor * moved[column], jnp.where(moving, factor, 0.0)
+
+
+@eqx.filter_jit
+def _whitened(raw: list[Linearised], whiten, steps, per_parameter) -> list[Linearised]:
+    result = []
+    for table, (weight, sigma), (slots, effects, live) in zip(raw, whiten, steps, strict=True):
+        scale = weight[:, None] / sigma
+        n = slots.shape[0]
+        every = jnp.concatenate([slots, jnp.broadcast_to(effects, (n, len(effects)))], axis=1)
+        step = per_parameter[every[:, jnp.asarray(live, int)]]
+        jacobian = table.jacobian * scale[:, :, None] * step[:, None, :]
+        result.append(Linearised(table.value * scale, jacobian, table.tangent * scale[:, :, None]))
+    return result
+
+
+@eqx.filter_jit
+def _assembled(
+    tables: list[Linearised],
+    packets_of: tuple[Packets, ...],
+    own_slots: list[int],
+    loss: Loss,
+    sizes: tuple[int, int, int],
+) -> Normal:
+    """Cost, gradient and Gauss-Newton matrix of linearised tables."""
+    s, groups, d = sizes
+    n = s + groups * d
+    cost = jnp.zeros(())
+    gradient = jnp.zeros(n + 1)
+    shared = jnp.zeros((s + 1, s + 1))
+    coupling = jnp.zeros((groups + 1, d + 1, s + 1))
+    local = jnp.zeros((groups + 1, d + 1, d + 1))
+    for table, packets, n_own in zip(tables, packets_of, own_slots, strict=True):
+        r = table.value
+        square = jnp.sum(r**2, axis=1)
+        cost = cost + 0.5 * jnp.sum(loss.value(square))
+        root = jnp.sqrt(loss.weight(square))[:, None]
+        gram, product = packet_products(packets, table.jacobian * root[:, :, None], r * root)
+        place, group, member = split_columns(packets.columns, sizes)
+        # What a packet has to itself is scattered; what all have in common (effects) is summed
+        # first, for it is most of a wide model.
+        k = sum(at < n_own for at in packets.live)
+        common = place[0, k:]
+        place, member = place[:, :k], member[:, :k]
+        gradient = gradient.at[packets.columns[:, :k]].add(product[:, :k])
+        gradient = gradient.at[packets.columns[0, k:]].add(jnp.sum(product[:, k:], axis=0))
+        own, cross = gram[:, :k, :k], gram[:, :k, k:]
+        mixed = jnp.zeros((s + 1, common.shape[0])).at[place].add(cross)
+        shared = shared.at[place[:, :, None], place[:, None, :]].add(own)
+        shared = shared.at[:, common].add(mixed).at[common].add(mixed.T)
+        both = jnp.sum(gram[:, k:, k:], axis=0)
+        shared = shared.at[common[:, None], common].add(both)
+        if groups:
+            where = group[:, None, None]
+            coupling = coupling.at[where, member[:, :, None], place[:, None, :]].add(own)
+            apart = jnp.zeros((groups + 1, d + 1, common.shape[0]))
+            apart = apart.at[group[:, None], member].add(cross)
+            coupling = coupling.at[:, :, common].add(apart)
+            local = local.at[where, member[:, :, None], member[:, None, :]].add(own)
+    arrow = Arrow(shared[:s, :s], coupling[:groups, :d, :s], local[:groups, :d, :d])
+    return Normal(cost, gradient[:n], arrow)
 
 
 def packet_products(
@@ -239,7 +272,6 @@ def scene_problem(scene: Scene, loss: Loss | None = None) -> Problem:
     )
 
 
-@eqx.filter_jit
 def normal_at(problem: Problem, x: Float[Array, " n"]) -> Normal:
     """Cost, gradient and normal matrix of a problem at x."""
     return problem.normal(x)

@@ -37,17 +37,21 @@ def redundancy(adjustment: Adjustment) -> tuple[np.ndarray, ...]:
     return tuple(np.asarray(b)[: f.n_real] for b, f in zip(blocks, factors, strict=True))
 
 
-@eqx.filter_jit
 def _redundancies(problem: Problem, x):
-    factors = factorise(problem.normal(x).hessian)
-    flat = problem.flat(x)
+    jacobians = [table.jacobian for table in problem.linearised(x)]
+    counted = [factor.weight > 0.0 for factor in problem.network.factors()]
+    hessian = problem.normal(x).hessian
+    return _complements(hessian, problem.packets, jacobians, counted, problem.sizes)
+
+
+@eqx.filter_jit
+def _complements(hessian, packets_of, jacobians, counted, sizes):
+    factors = factorise(hessian)
     result = []
-    for factor, packets in zip(problem.network.factors(), problem.packets, strict=True):
-        jacobian = problem.jacobian(factor, packets, flat)
-        half = half_rows(factors, packets, jacobian, problem.sizes)
+    for packets, jacobian, used in zip(packets_of, jacobians, counted, strict=True):
+        half = half_rows(factors, packets, jacobian, sizes)
         hat = jnp.einsum("nak,nbk->nab", half, half)
-        counted = (factor.weight > 0.0)[:, None, None]
-        result.append(counted * jnp.eye(hat.shape[1]) - hat)
+        result.append(used[:, None, None] * jnp.eye(hat.shape[1]) - hat)
     return result
 
 

@@ -1,0 +1,76 @@
+"""Tables evaluated in blocks of a fixed number of rows: programs fit recordings of any size.
+
+Compiling the chain and its derivatives takes seconds, running it milliseconds. A program for a
+block of rows is compiled once and serves every recording with such cameras; a program for a whole
+table would serve recordings of that very size alone. Under a transformation of JAX (`jit`, `vmap`,
+`grad`) and on an accelerator the whole table is one program, as usual.
+"""
+
+from collections.abc import Callable
+
+import jax
+import numpy as np
+
+BLOCK = 1024
+"""Rows of a block."""
+
+_SMALL = 64
+"""Rows of a block of a small table."""
+
+
+def traced(*values) -> bool:
+    """Whether a transformation of JAX is under way on any of the arrays."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
+
+
+def by_blocks(function: Callable, table, *common):
+    """`function(table, *common)`, computed block by block of the table's rows.
+
+    Args:
+        function: compiled; every leaf of its result leads with the rows of its first argument.
+        table: PyTree whose leaves lead with the rows; scalars go along unchanged.
+        common: what all rows share.
+    """
+    if traced(table, common) or jax.default_backend() != "cpu":
+        return function(table, *common)
+    leaves, structure = jax.tree.flatten(table)
+    leaves = [np.asarray(leaf) for leaf in leaves]
+    n = max(len(leaf) for leaf in leaves if leaf.ndim)
+    size = _SMALL if n <= _SMALL else BLOCK
+    found = []
+    for start in range(0, n, size):
+        block = [_cut(leaf, start, size) if leaf.ndim else leaf for leaf in leaves]
+        found.append(function(jax.tree.unflatten(structure, block), *common))
+    return jax.tree.map(lambda *parts: np.concatenate(parts)[:n], *found)
+
+
+def _cut(leaf: np.ndarray, start: int, size: int) -> np.ndarray:
+    """Rows of a block; the last row again where the table ends."""
+    if start + size <= len(leaf):
+        return leaf[start : start + size]
+    return leaf[np.minimum(np.arange(start, start + size), len(leaf) - 1)]
+
+
+def roomy(values, axis: int = 0, least: int = 64):
+    """An array filled up with its last value along an axis, to a power of two, `least` or more."""
+    return _grown(values, axis, least, mode="edge")
+
+
+def continued(series):
+    """Series (last axis) that go on in a straight line, as long as a power of two.
+
+    Where a series ends, neither its values nor its central differences change.
+    """
+    if series.shape[-1] < 2:
+        return series
+    return _grown(series, -1, 64, mode="reflect", reflect_type="odd")
+
+
+def _grown(values, axis: int, least: int, **how):
+    n = values.shape[axis]
+    size = max(least, 1 << max(n - 1, 0).bit_length())
+    if traced(values) or n in (0, size):
+        return values
+    widths = [(0, 0)] * np.ndim(values)
+    widths[axis] = (0, size - n)
+    return np.pad(np.asarray(values), widths, **how)
