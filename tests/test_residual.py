@@ -23,9 +23,9 @@ from networks import (
 from scipy.linalg import logm
 
 from jaxvm.network.factors import PixelFactor, RangeFactor
-from jaxvm.network.residual import block_jacobian, port_jacobian, residual, whitening
+from jaxvm.network.residual import linearise, residual, whitening
 from jaxvm.network.scene import build
-from jaxvm.physics.effects import Effect, Scope, Term
+from jaxvm.physics.effects import Effect, Scope, Term, course_slopes, courses
 from jaxvm.physics.ports import N_PORTS, PORTS
 from jaxvm.recording.model import Prior
 
@@ -49,6 +49,14 @@ def forward_jacobian(flat, network):
     return jax.jacfwd(of_flat)(flat, network)
 
 
+def linearised(factor, network, flat, live=(), tangent=False):
+    """A table with its derivatives."""
+    constant = network.layout.restore(flat).constant
+    values = courses(network.effects, constant, network.channels)
+    slopes = course_slopes(network.effects, constant, network.channels)
+    return linearise(factor, network, flat, values, slopes, live, tangent)
+
+
 @eqx.filter_jit
 def assembled_jacobian(flat, network):
     """The blocks of every table, whitened and put in their places."""
@@ -57,7 +65,7 @@ def assembled_jacobian(flat, network):
     for factor in network.factors():
         n, own = factor.slots.shape
         live = tuple(range(own + len(effects)))
-        block = block_jacobian(factor, network, flat, live) * whitening(factor)[:, :, None]
+        block = linearised(factor, network, flat, live).jacobian * whitening(factor)[:, :, None]
         slots = jnp.concatenate(
             [factor.slots, jnp.broadcast_to(jnp.asarray(effects, int), (n, len(effects)))], axis=1
         )
@@ -192,7 +200,8 @@ def test_port_jacobian_is_the_derivative_by_an_effect_on_each_port(stereo):
     with_all = scene.with_effects(effects)
     amplitude = with_all.network.layout.all("amplitude")[:N_PORTS]
     tangents = [
-        eqx.filter_jit(port_jacobian)(f, scene.network, scene.state) * whitening(f)[:, :, None]
+        linearised(f, scene.network, scene.state.flatten(), tangent=True).tangent
+        * whitening(f)[:, :, None]
         for f in scene.network.factors()
         if isinstance(f, PixelFactor | RangeFactor)
     ]
@@ -345,3 +354,17 @@ def test_an_effect_of_no_size_changes_nothing():
     scene = at_values(build(without_starts(known.recording)), known.truth)
     scene = scene.with_effects((Effect("growth", (Term("target.scale"),)),))
     assert np.abs(of_flat(scene.state.flatten(), scene.network)).max() < 1e-8
+
+
+def test_blocks_are_the_whole_table(exact):
+    """Whether rows are computed in blocks or as one program under `jit`, they are the same."""
+    _, scene = exact
+    network, flat = scene.network, scene.state.flatten()
+    for factor in network.factors():
+        n_own = factor.slots.shape[1]
+        live = tuple(range(n_own + network.effects.n_columns))
+        apart = linearised(factor, network, flat, live, True)
+        whole = eqx.filter_jit(linearised)(factor, network, flat, live, True)
+        for a, b in zip(apart, whole, strict=True):
+            assert a.shape == b.shape
+            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)

@@ -85,6 +85,8 @@ def sharing(fitted: Adjustment, place: int, split: Split) -> Sharing | None:
     columns = np.arange(first, first + n * m)
     values = np.asarray(apart.scene.state.amplitude)[columns]
     spread = variance * amplitude_covariance(apart, columns)
+    if not np.isfinite(spread).all():
+        return None
     blocks = spread.reshape(n, m, n, m)
     has_it = []
     for k in range(n):

@@ -20,7 +20,6 @@ independence inside an epoch (wild bootstrap of the scores).
 import math
 from dataclasses import dataclass, replace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -29,10 +28,9 @@ from jaxvm.discover.cells import Arrangement, Cells
 from jaxvm.discover.hypotheses import Family, Hypothesis, member
 from jaxvm.network.binding import in_scope, ranges_in_scope
 from jaxvm.network.scene import Scene
-from jaxvm.physics.blocks import by_blocks, continued, roomy
 from jaxvm.physics.drivers import pattern
-from jaxvm.physics.effects import Scope, at_epochs
-from jaxvm.physics.forms import BASIS_INDEX, FORMS, evaluate_basis
+from jaxvm.physics.effects import Scope, evaluate
+from jaxvm.physics.forms import BASIS_INDEX, FORMS
 from jaxvm.physics.ports import PORT_INDEX
 
 _ABSORBED = 1e-8
@@ -227,16 +225,8 @@ def course_tables(scene: Scene, families: tuple[Family, ...]) -> list[np.ndarray
                     constants.append((*course.constants, 1.0, 1.0)[:2])
                 own.append(place[key])
         index.append(np.array(own).reshape(len(family.courses), family.n_bases))
-    grid = (continued(channels.time), roomy(channels.epoch_time))
-    rows = (np.array(basis), continued(np.array(x)), np.array(constants))
-    table = by_blocks(_evaluate, rows, *grid)[:, : len(channels.epoch_time)]
-    return [table[own] for own in index]
-
-
-@jax.jit
-def _evaluate(rows, time, epoch_time):
-    evaluate = jax.vmap(lambda b, x, c: evaluate_basis(b, x, time, c))
-    return at_epochs(evaluate(*rows), time, epoch_time)
+    table = evaluate((np.array(basis), np.array(x), np.array(constants)), channels)
+    return [np.asarray(table)[own] for own in index]
 
 
 @dataclass(frozen=True)

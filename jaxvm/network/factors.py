@@ -49,6 +49,10 @@ class Factor(eqx.Module):
     def widths(self) -> tuple[int, ...]:
         """How many slots each parameter has: a focal length 2, a pose 6, a point 3."""
 
+    def bare(self) -> "Factor":
+        """The table without what the effects add to it."""
+        return self
+
     @abc.abstractmethod
     def data(self) -> PyTree:
         """PyTree of the recorded values; its leaves lead with the observations."""
@@ -78,6 +82,9 @@ class PixelFactor(Factor):
     def n_real(self) -> int:
         return int(self.real)
 
+    def bare(self):
+        return eqx.tree_at(lambda f: f.pattern, self, self.pattern[:, :0])
+
     def data(self):
         return self.circumstances
 
@@ -100,6 +107,9 @@ class RangeFactor(Factor):
     measured: Float[Array, " observations"]
     epoch: Int[Array, " observations"]
     pattern: Float[Array, "observations columns"]
+
+    def bare(self):
+        return eqx.tree_at(lambda f: f.pattern, self, self.pattern[:, :0])
 
     def data(self):
         return self.circumstances, self.to_plane, self.measured

@@ -22,7 +22,7 @@ from jaxvm.network.factors import (
     RangeFactor,
 )
 from jaxvm.network.state import Layout, State
-from jaxvm.physics.blocks import by_blocks, roomy
+from jaxvm.physics.blocks import by_blocks, hosted, roomy
 from jaxvm.physics.effects import Channels, EffectTable, courses
 from jaxvm.physics.ports import N_PORTS, PortValues
 
@@ -103,7 +103,22 @@ def rows(
     """Predicted minus measured of one table, in its unit."""
     amplitude = flat[jnp.asarray(network.layout.all("amplitude"))]
     acting = Acting(amplitude, network.effects.ports, values)
-    return by_blocks(_rows, factor, roomy(flat), acting.roomy())
+    return _chained(_values, factor, flat, _ports(factor, acting.roomy()))
+
+
+def _chained(function, factor: Factor, flat, ports):
+    """A function of a table, the flat state and the port values of each row, block by block.
+
+    It knows nothing of effects, so their number changes no program of the chain.
+    """
+    n = factor.slots.shape[0]
+    ports = np.zeros((n, 0)) if ports is None else ports
+    return by_blocks(partial(_apart, function), (factor.bare(), ports), roomy(flat))
+
+
+def _apart(function, table, flat):
+    factor, ports = table
+    return function(factor, flat, ports if ports.shape[1] else None)
 
 
 class Acting(NamedTuple):
@@ -126,17 +141,22 @@ def parts_of(factor: Factor, flat: Float[Array, " n"]) -> tuple[Float[Array, "n 
 
 
 @eqx.filter_jit
-def _rows(factor: Factor, flat, acting: Acting) -> Float[Array, "observations components"]:
+def _values(factor: Factor, flat, ports) -> Float[Array, "observations components"]:
     local = jax.vmap(lambda own, data, ports: factor.local(own, data, PortValues(ports)))
-    return local(parts_of(factor, flat), factor.data(), _ports(factor, acting))
+    return local(parts_of(factor, flat), factor.data(), ports)
 
 
 def _ports(factor: Factor, acting: Acting) -> Float[Array, "observations ports"] | None:
     """Port values of each observation: what all effects together do to it; None without effects."""
     if not (isinstance(factor, PixelFactor | RangeFactor) and len(acting.amplitude)):
         return None
-    course = acting.amplitude * acting.value.T[factor.epoch] * factor.pattern
-    return course @ acting.ports
+    return by_blocks(_port_values, (factor.epoch, factor.pattern), acting)
+
+
+@jax.jit
+def _port_values(table, acting: Acting):
+    epoch, pattern = table
+    return (acting.amplitude * acting.value.T[epoch] * pattern) @ acting.ports
 
 
 class Linearised(NamedTuple):
@@ -163,40 +183,53 @@ def linearise(
     through the ports: one derivative by the ports serves all amplitudes and constants. Without any
     the tangent is computed when it is asked for, else it is empty.
     """
-    layout = network.layout
+    layout, n_own = network.layout, factor.slots.shape[1]
     amplitude = flat[jnp.asarray(layout.all("amplitude"))]
     acting = Acting(amplitude, network.effects.ports, values).roomy()
-    n_constants = len(layout.all("constant"))
-    owner = jax.nn.one_hot(network.effects.constant_index, n_constants, dtype=float)
-    common = (roomy(flat), acting, roomy(slopes, axis=1), owner)
-    return by_blocks(partial(_linearise, live=live, tangent=tangent), factor, *common)
-
-
-@eqx.filter_jit
-def _linearise(factor: Factor, flat, acting: Acting, slopes, owner, live, tangent) -> Linearised:
-    n_own = factor.slots.shape[1]
-    own = [at for at in live if at < n_own]
-    of_effects = jnp.asarray([at - n_own for at in live if at >= n_own], int)
     ports = _ports(factor, acting)
     affected = ports is not None
     if tangent and not affected and isinstance(factor, PixelFactor | RangeFactor):
-        ports = jnp.zeros((factor.slots.shape[0], N_PORTS))
-    value, by_own, by_ports = _derivatives(factor, parts_of(factor, flat), ports, own)
-    if not affected or not of_effects.size:
-        nothing = jnp.zeros((*value.shape, of_effects.size))
-        return Linearised(value, jnp.concatenate([by_own, nothing], axis=2), by_ports)
-    entering = (by_ports @ acting.ports.T) * factor.pattern[:, None, :]
-    slope = jnp.moveaxis(slopes, 1, 0)[factor.epoch]
+        ports = np.zeros((factor.slots.shape[0], N_PORTS))
+    own = tuple(at for at in live if at < n_own)
+    value, by_own, by_ports = _chained(partial(_derivatives, live=own), factor, flat, ports)
+    wanted = tuple(at - n_own for at in live if at >= n_own)
+    if not affected or not wanted:
+        by_effects = jnp.zeros((*value.shape, len(wanted)))
+    else:
+        assert isinstance(factor, PixelFactor | RangeFactor)
+        owner = _owners(network.effects, len(layout.all("constant")))
+        table = (by_ports, factor.epoch, factor.pattern)
+        by_effects = by_blocks(_by_effects, table, acting, roomy(slopes, axis=1), owner)
+        by_effects = by_effects[:, :, np.asarray(wanted)]
+    joined = np.concatenate if isinstance(by_own, np.ndarray) else jnp.concatenate
+    return Linearised(value, joined([by_own, by_effects], axis=2), by_ports)
+
+
+def _owners(effects: EffectTable, n: int) -> Float[Array, "columns 2 constants"]:
+    """1 where a constant is the first or second one of a column."""
+    (index,) = hosted(effects.constant_index)
+    return (index[:, :, None] == np.arange(n)).astype(float)
+
+
+@jax.jit
+def _by_effects(table, acting: Acting, slopes, owner):
+    """Derivatives of rows by all amplitudes, then by all constants of effects."""
+    by_ports, epoch, pattern = table
+    n, components, _ = by_ports.shape
+    entering = (by_ports @ acting.ports.T) * pattern[:, None, :]
+    by_amplitudes = entering * acting.value.T[epoch][:, None, :]
+    slope = jnp.moveaxis(slopes, 1, 0)[epoch]
     moved = (entering * acting.amplitude)[..., None] * slope[:, None]
-    n_constants = owner.shape[2]
-    by_constants = jnp.reshape(moved, (*value.shape, -1)) @ jnp.reshape(owner, (-1, n_constants))
-    by_amplitudes = entering * acting.value.T[factor.epoch][:, None, :]
-    every = jnp.concatenate([by_amplitudes, by_constants], axis=2)[:, :, of_effects]
-    return Linearised(value, jnp.concatenate([by_own, every], axis=2), by_ports)
+    by_constants = jnp.reshape(moved, (n, components, -1)) @ jnp.reshape(
+        owner, (-1, owner.shape[2])
+    )
+    return jnp.concatenate([by_amplitudes, by_constants], axis=2)
 
 
-def _derivatives(factor: Factor, parts, ports, live: list[int]):
+@eqx.filter_jit
+def _derivatives(factor: Factor, flat, ports, live: tuple[int, ...]):
     """Values of the rows, and their derivatives by live slots of their own and by all ports."""
+    parts = parts_of(factor, flat)
     ends = np.cumsum([part.shape[1] for part in parts])
     first = np.concatenate([[0], ends])[:-1]
     # Only parameters with a wanted slot are differentiated; the others are constants.
@@ -212,6 +245,9 @@ def _derivatives(factor: Factor, parts, ports, live: list[int]):
         return value, value
 
     free = [parts[k] for k in moving]
+    if not free and ports is None:
+        value = _values(factor, flat, None)
+        return value, *(2 * (jnp.zeros((*value.shape, 0)),))
     derivative = jax.vmap(jax.jacrev(local, argnums=(0, 1), has_aux=True))
     (blocks, by_ports), value = derivative(free, ports, parts, factor.data())
     none = jnp.zeros((*value.shape, 0))

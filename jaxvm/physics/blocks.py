@@ -23,20 +23,28 @@ def traced(*values) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
 
 
-def by_blocks(function: Callable, table, *common):
+def hosted(*arrays):
+    """Arrays as NumPy's where no transformation is under way: indexing them compiles nothing."""
+    if traced(arrays) or jax.default_backend() != "cpu":
+        return arrays
+    return tuple(np.asarray(array) for array in arrays)
+
+
+def by_blocks(function: Callable, table, *common, size: int | None = None):
     """`function(table, *common)`, computed block by block of the table's rows.
 
     Args:
         function: compiled; every leaf of its result leads with the rows of its first argument.
         table: PyTree whose leaves lead with the rows; scalars go along unchanged.
         common: what all rows share.
+        size: rows of a block; by default `BLOCK`, less for a small table.
     """
     if traced(table, common) or jax.default_backend() != "cpu":
         return function(table, *common)
     leaves, structure = jax.tree.flatten(table)
     leaves = [np.asarray(leaf) for leaf in leaves]
     n = max(len(leaf) for leaf in leaves if leaf.ndim)
-    size = _SMALL if n <= _SMALL else BLOCK
+    size = size or (_SMALL if n <= _SMALL else BLOCK)
     found = []
     for start in range(0, n, size):
         block = [_cut(leaf, start, size) if leaf.ndim else leaf for leaf in leaves]

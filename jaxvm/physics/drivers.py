@@ -8,7 +8,7 @@ residuals explains noise. (A mark at rest shows noise e at phase phi; e sin 2 pi
 average out.)
 """
 
-from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxvm.geometry.poses import pose_from_vector
+from jaxvm.physics.blocks import by_blocks, hosted
 from jaxvm.physics.chain import Aim, Circumstances, Sight, predict_range
 from jaxvm.physics.effects import Channels, Term
 from jaxvm.physics.forms import BASES, bump
@@ -189,19 +190,30 @@ def pattern(
     term: Term, drivers: Float[Array, "observations drivers"]
 ) -> Float[Array, " observations"]:
     """Pattern of one term over a table of observations; 0 where its driver has no meaning (NaN)."""
+    constants = np.array((*term.constants, 1.0, 1.0)[:2], float)
+    (drivers,) = hosted(drivers)
     if term.driver in PLANES:
         x_name, y_name, width = PLANES[term.driver]
-        spot = [
-            bump(drivers[:, OBSERVATION_DRIVER_INDEX[name]], jnp.asarray(c), jnp.asarray(width))
-            for name, c in zip((x_name, y_name), term.constants, strict=True)
-        ]
-        return jnp.nan_to_num(spot[0] * spot[1])
-    x = drivers[:, OBSERVATION_DRIVER_INDEX[term.driver]]
-    known = jnp.isfinite(x)
-    x = jnp.where(known, x, 0.0)
-    constants = jnp.asarray((*term.constants, 1.0, 1.0)[:2])
-    basis: Callable = BASES[term.basis]
-    return jnp.where(known, basis(x, x, constants), 0.0)
+        columns = [OBSERVATION_DRIVER_INDEX[name] for name in (x_name, y_name)]
+        x = drivers[:, np.array(columns)]
+        evaluate, known = partial(_spot, width=width), jnp.isfinite(x).all(axis=1)
+    else:
+        x = drivers[:, OBSERVATION_DRIVER_INDEX[term.driver]]
+        evaluate, known = partial(_basis, name=term.basis), jnp.isfinite(x)
+    (known,) = hosted(known)
+    values = by_blocks(evaluate, x, constants)
+    return (np if isinstance(values, np.ndarray) else jnp).where(known, values, 0.0)
+
+
+@partial(jax.jit, static_argnames="name")
+def _basis(x, constants, name: str):
+    x = jnp.where(jnp.isfinite(x), x, 0.0)
+    return BASES[name](x, x, constants)
+
+
+@jax.jit
+def _spot(x, constants, width):
+    return bump(x[:, 0], constants[0], width) * bump(x[:, 1], constants[1], width)
 
 
 def build_channels(

@@ -13,6 +13,7 @@ target, how the row or the radius enters) is a table.
 """
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -20,8 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxvm.physics.blocks import continued, roomy
-from jaxvm.physics.forms import BASIS_INDEX, FORMS, Form, evaluate_basis
+from jaxvm.physics.blocks import by_blocks, continued, hosted, roomy, traced
+from jaxvm.physics.forms import BASIS_INDEX, EVERY_KIND, FORMS, Form, evaluate_basis, kinds_of
 from jaxvm.physics.ports import N_PORTS, PORT_INDEX
 
 
@@ -145,11 +146,6 @@ class Channels(eqx.Module):
         """Mean of a channel over the epochs, the reference of centred forms."""
         return float(np.mean(np.interp(self.epoch_time, self.time, self.values[self.index(name)])))
 
-    def roomy(self):
-        """Values, times and times of epochs with spare room: other lengths are no other program."""
-        values, time = (continued(series) for series in (self.values, self.time))
-        return roomy(values, least=16), time, roomy(self.epoch_time)
-
 
 class EffectTable(eqx.Module):
     """A list of effects as arrays. Unused columns have no port and no pattern."""
@@ -218,43 +214,77 @@ def room_for(effects: tuple[Effect, ...], present: tuple[int, int]) -> tuple[int
     columns, constants = capacity(effects)
     if columns <= present[0] and constants <= present[1]:
         return present
-    return 80 * -(-columns // 80), max(16 * -(-constants // 16), present[1])
+    wide = 40 << max(-(-columns // 40) - 1, 0).bit_length()
+    return wide, max(16 * -(-constants // 16), present[1])
 
 
 def courses(
     table: EffectTable, constants: Float[Array, " constants"], channels: Channels
 ) -> Float[Array, "columns epochs"]:
     """Course of every column at the epochs. Differentiable in the constants."""
-    n = len(channels.epoch_time)
-    return _courses(table, constants[table.constant_index], *channels.roomy())[:, :n]
+    return evaluate(_as_rows(table, constants, channels), channels)
 
 
 def course_slopes(
     table: EffectTable, constants: Float[Array, " constants"], channels: Channels
 ) -> Float[Array, "columns epochs 2"]:
     """Derivative of every column's course with respect to its own two constants."""
-    n = len(channels.epoch_time)
-    return _course_slopes(table, constants[table.constant_index], *channels.roomy())[:, :n]
+    return _by_kinds(_slopes, _as_rows(table, constants, channels), channels)
 
 
-@jax.jit
-def _courses(table: EffectTable, own: Float[Array, "columns 2"], values, time, epoch_time):
-    x = values[table.channel] - table.reference[:, None]
-    on_grid = jax.vmap(lambda b, xi, c: evaluate_basis(b, xi, time, c))(table.basis, x, own)
-    return at_epochs(on_grid, time, epoch_time)
+_FEW = 16
+"""Courses that are evaluated at once."""
 
 
-@jax.jit
-def _course_slopes(table: EffectTable, own: Float[Array, "columns 2"], *grid):
+def _as_rows(table: EffectTable, constants, channels: Channels):
+    """Basis, driver and constants of each column."""
+    values, channel, reference = hosted(channels.values, table.channel, table.reference)
+    constants, index = hosted(constants, table.constant_index)
+    return table.basis, values[channel] - reference[:, None], constants[index]
+
+
+def evaluate(rows, channels: Channels) -> Float[Array, "n epochs"]:
+    """Courses of many bases at the epochs.
+
+    Args:
+        rows: for each its number [n], its driver over the grid of times [n, times], and its
+            constants [n, 2].
+        channels: the grid of times, and the epochs.
+    """
+    return _by_kinds(_at_epochs, rows, channels)
+
+
+def _by_kinds(function, rows, channels: Channels):
+    """A function of courses at the epochs, evaluated for those of one kind of basis at once."""
+    n, grid = len(channels.epoch_time), (channels.time, channels.epoch_time)
+    if traced(rows, grid) or not len(rows[0]):
+        return function(rows, *grid)
+    # Spare times: a recording of another length is no other program.
+    grid = continued(channels.time), roomy(channels.epoch_time)
+    basis, x, constants = map(np.asarray, rows)
+    rows, kind = (basis, continued(x), constants), kinds_of(basis)
+    found = []
+    for own in np.unique(kind):
+        of_kind = partial(function, kinds=(int(own),))
+        chosen = tuple(part[kind == own] for part in rows)
+        found.append(np.asarray(by_blocks(of_kind, chosen, *grid, size=_FEW)))
+    order = np.argsort(np.argsort(kind, kind="stable"), kind="stable")
+    return np.concatenate(found)[order, :n]
+
+
+@partial(jax.jit, static_argnames="kinds")
+def _at_epochs(rows, time, epoch_time, kinds=EVERY_KIND):
+    on_grid = jax.vmap(lambda b, x, c: evaluate_basis(b, x, time, c, kinds))(*rows)
+    return jax.vmap(lambda y: jnp.interp(epoch_time, time, y))(on_grid)
+
+
+@partial(jax.jit, static_argnames="kinds")
+def _slopes(rows, time, epoch_time, kinds=EVERY_KIND):
     # One shift for all columns: a column depends on no constant but its own two.
-    return jax.jacfwd(lambda by: _courses(table, own + by, *grid))(jnp.zeros(2))
-
-
-def at_epochs(
-    courses: Float[Array, "n times"], time: Float[Array, " times"], epoch_time
-) -> Float[Array, "n epochs"]:
-    """Courses on the grid, read at the epochs by linear interpolation."""
-    return jax.vmap(lambda y: jnp.interp(epoch_time, time, y))(courses)
+    basis, x, constants = rows
+    return jax.jacfwd(lambda by: _at_epochs((basis, x, constants + by), time, epoch_time, kinds))(
+        jnp.zeros(2)
+    )
 
 
 def form_of(effect: Effect) -> Form:

@@ -11,6 +11,7 @@ from typing import cast
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 Course = Float[Array, " times"]
@@ -100,17 +101,38 @@ _PLACED = ("step", "ramp", "bump", "play", *(f"knot {k}" for k in range(_MOST_KN
 
 BASIS_INDEX = {name: index for index, name in enumerate(BASES)}
 
+_BUMP = BASIS_INDEX["bump"]
+"""The last basis but for the knots, which are bumps with a place of their own."""
+
+
+EVERY_KIND = tuple(range(_BUMP + 1))
+
+
+def kinds_of(basis: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+    """The programs behind numbers of bases: all knots are bumps."""
+    return np.minimum(basis, _BUMP)
+
 
 def evaluate_basis(
-    basis: Int[Array, ""], x: Course, t: Course, constants: Constants
+    basis: Int[Array, ""],
+    x: Course,
+    t: Course,
+    constants: Constants,
+    kinds: tuple[int, ...] = EVERY_KIND,
 ) -> Float[Array, " times"]:
-    """Course of the basis with number `basis`; the number is data, so nothing is recompiled."""
+    """Course of the basis with number `basis`; the number is data, so nothing is recompiled.
+
+    Only the `kinds` of bases that may occur are computed; the others give something else.
+    """
+    knot = jnp.maximum(basis - _BUMP - 1, 0)
+    placed = jnp.stack([constants[0] + knot * constants[1], constants[1]])
     # Bases that are computed along and thrown away must not divide by an instant at zero, and an
     # optimiser that steps to a negative time constant meets the limit of a very short one.
     positive = jnp.maximum(constants, 1e-9)
-    return jnp.stack(
-        [f(x, t, constants if name in _PLACED else positive) for name, f in BASES.items()]
-    )[basis]
+    names = [list(BASES)[kind] for kind in kinds]
+    each = [BASES[name](x, t, placed if name in _PLACED else positive) for name in names]
+    place = jnp.searchsorted(jnp.asarray(kinds), jnp.minimum(basis, _BUMP))
+    return each[0] if len(each) == 1 else jnp.stack(each)[place]
 
 
 @dataclass(frozen=True)

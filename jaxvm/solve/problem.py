@@ -45,11 +45,17 @@ def pack(factor: Factor, layout: Layout, unknowns: Unknowns) -> Packets:
     """
     own = np.asarray(factor.slots)[: factor.n_real]
     effects = np.concatenate([layout.all("amplitude"), layout.all("constant")])
-    slots = np.concatenate([own, np.tile(effects, (len(own), 1))], axis=1)
-    columns = unknowns.column[slots]
-    live = np.flatnonzero((columns < unknowns.n).any(axis=0))
-    columns = columns[:, live]
-    distinct, packet = np.unique(columns, axis=0, return_inverse=True)
+    columns, common = unknowns.column[own], unknowns.column[effects]
+    of_own = np.flatnonzero((columns < unknowns.n).any(axis=0))
+    of_effects = np.flatnonzero(common < unknowns.n)
+    live = (*of_own, *(own.shape[1] + of_effects))
+    columns = columns[:, of_own]
+    # Rows that touch the same unknowns have the same sum of hashes.
+    hashes = np.random.default_rng(0).integers(1 << 62, size=columns.shape[1], dtype=np.int64)
+    _, first, packet = np.unique(columns @ hashes, return_index=True, return_inverse=True)
+    distinct = np.concatenate(
+        [columns[first], np.tile(common[of_effects], (len(first), 1))], axis=1
+    )
     packet = packet.ravel()
     counts = np.bincount(packet, minlength=len(distinct))
     order = np.argsort(packet, kind="stable")
