@@ -13,7 +13,6 @@ lambda - d: the gap. (MATHEMATICS 1.8.)
 
 from dataclasses import asdict, dataclass
 
-import jax.numpy as jnp
 import numpy as np
 from names import Facts
 from scipy.spatial.transform import Rotation
@@ -139,14 +138,16 @@ def in_cells(arrangement: Arrangement, values: np.ndarray) -> np.ndarray:
 def projected(cells: Cells, e: np.ndarray) -> np.ndarray:
     """M e = e - J L^-T (J L^-T)^T e for a vector in cells."""
     d = cells.n_local
-    shared = jnp.einsum("nr,nrs->s", e, cells.half[:, :, d:])
-    absorbed = jnp.einsum("s,nrs->nr", shared, cells.half[:, :, d:])
+    half = cells.half[:, :, d:]
+    shared = np.einsum("nr,nrs->s", e, half)
+    absorbed = np.einsum("s,nrs->nr", shared, half)
     if d:
-        own = jnp.einsum("nr,nrd->dn", e, cells.half[:, :, :d])
-        of_group = jnp.sum(cells.by(cells.group, own), axis=2)
-        back = jnp.concatenate([of_group, jnp.zeros((d, 1))], axis=1)[:, cells.group_of]
-        absorbed = absorbed + jnp.einsum("dn,nrd->nr", back, cells.half[:, :, :d])
-    return e - np.asarray(absorbed)
+        half = cells.half[:, :, :d]
+        own = np.einsum("nr,nrd->dn", e, half)
+        of_group = np.sum(cells.by(cells.group, own), axis=2)
+        back = np.concatenate([of_group, np.zeros((d, 1))], axis=1)[:, cells.group_of]
+        absorbed = absorbed + np.einsum("dn,nrd->nr", back, half)
+    return e - absorbed
 
 
 def by_rows(arrangement: Arrangement, cells: np.ndarray) -> np.ndarray:
