@@ -25,12 +25,14 @@ class Accepted:
         near: others that were refitted and fell behind only a little, best first.
         heldout: its errors on the held-out epochs.
         gain: what it improves there.
+        tried: everything that was refitted.
     """
 
     chosen: Candidate
     near: tuple[Candidate, ...]
     heldout: HeldOut
     gain: Gain
+    tried: tuple[Candidate, ...]
 
 
 def accept(
@@ -68,7 +70,7 @@ def accept(
                     for c in sorted(refitted, key=lambda c: -c.evidence)
                     if c is not candidate and candidate.evidence - c.evidence < gap
                 )
-                return Accepted(candidate, others, tried, proof)
+                return Accepted(candidate, others, tried, proof, tuple(refitted))
             hopeless.add((identity(candidate.hypothesis), candidate.hypothesis.course))
     return short(leading[0][0])
 

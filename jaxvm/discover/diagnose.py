@@ -114,7 +114,7 @@ def diagnose(
             break
         chosen = accepted.chosen
         weight, doubles = rivals(
-            current.scene, arrangement, asked, chosen, accepted.near, current, parts.n, signs
+            current.scene, arrangement, asked, accepted, leading, current, parts.n, signs
         )
         findings.append(
             Finding(

@@ -330,7 +330,9 @@ def _courses(scene: Scene) -> list[Course]:
                 Course(name, "quadratic", (), reference),
                 *(Course(name, "lag", (float(tau),), reference) for tau in lags),
                 Course(name, "two lags", (float(lags[1]), float(lags[4])), reference),
+                Course(name, "proportional"),
                 Course(name, "rate"),
+                *(Course(name, "transient", (float(tau),)) for tau in lags[:4]),
                 Course(name, "direction", (float(np.median(rates)) + 1e-12,)),
                 *(
                     Course(name, "hysteresis", (float(share * width),), reference)
@@ -346,6 +348,11 @@ def _courses(scene: Scene) -> list[Course]:
             if kind == "time":
                 courses.append(Course(name, "linear", (), reference))
                 courses += _courses_of_time(name, since, span, spacing)
+                courses += [
+                    Course(name, "settling", (float(start), float(tau)))
+                    for start in np.linspace(0.1, 0.7, 7) * span
+                    for tau in lags[2::2]
+                ]
     return courses
 
 
@@ -355,7 +362,7 @@ def _courses_of_time(name: str, since: np.ndarray, span: float, spacing: float) 
     inside = between[2:-2]
     if len(inside) > 60:
         inside = inside[np.linspace(0, len(inside) - 1, 60).astype(int)]
-    periods = span / np.arange(1.0, min(span / (2.5 * spacing), 16.0), 0.5)
+    periods = span / np.arange(1.0, min(span / (2.5 * spacing), 34.0), 0.5)
     return [
         *(Course(name, "step", (float(t),)) for t in inside),
         *(Course(name, "ramp", (float(t),)) for t in np.linspace(0.1, 0.8, 8) * span),

@@ -5,7 +5,10 @@ The evidence is on the scale of chi-square (twice the log of a posterior weight,
     E = drop / variance - columns ln n + 2 ln prior.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,6 +21,9 @@ from jaxvm.physics.catalogue import Entry
 from jaxvm.physics.effects import Effect, room_for
 from jaxvm.physics.forms import FORMS
 from jaxvm.solve.adjust import Adjustment, adjust
+
+if TYPE_CHECKING:
+    from jaxvm.discover.accept import Accepted
 
 DECIDED = 2.0 * np.log(20.0)
 """Gap in chi-square at which one hypothesis is twenty times as likely as another."""
@@ -187,8 +193,8 @@ def rivals(
     scene: Scene,
     arrangement: Arrangement,
     battery: Battery,
-    chosen: Candidate,
-    near: tuple[Candidate, ...],
+    accepted: Accepted,
+    leading,
     before: Adjustment,
     n: int,
     signs: np.ndarray,
@@ -197,12 +203,14 @@ def rivals(
 
     With e the chosen effect as it stands in the residuals and lambda = |e|^2 its drop of
     chi-square, a hypothesis that explains the share rho^2 of e is worse by lambda (1 - rho^2): what
-    the recording can be expected to show. Of `near` ones, refitted, what it did show counts, too.
+    the recording can be expected to show. What it did show counts, too: of refitted ones (`near`),
+    and of `leading` ones that were not worth a refit, as one tangent foretells it.
     Other names for the chosen combination are always rivals.
 
     Returns:
         The posterior weight of the chosen one, and its rivals with theirs.
     """
+    chosen, near = accepted.chosen, accepted.near
     variance = chosen.adjustment.variance_factor
     change = stacked(before) - stacked(chosen.adjustment)
     full = float(np.sum(change**2)) / variance
@@ -234,6 +242,13 @@ def rivals(
             gap = 2.0 * (other.adjustment.cost - chosen.adjustment.cost) / variance
             prior = log_prior(other.hypothesis, amplitudes) - own_prior
             weigh(other.hypothesis, amplitudes, max(float(gap), 0.0), -0.5 * behind - prior)
+    refitted = [candidate.hypothesis for candidate in accepted.tried]
+    foretold = [own for h, own, _ in leading if h.same(chosen.hypothesis)]
+    for hypothesis, own, amplitudes in leading if foretold else ():
+        behind = max(foretold[0] - own, 0.0)
+        if behind <= DECIDED and not any(r.same(hypothesis) for r in refitted):
+            prior = log_prior(hypothesis, np.asarray(amplitudes)) - own_prior
+            weigh(hypothesis, amplitudes, behind, -0.5 * behind - prior)
     weigh(chosen.hypothesis, np.asarray(chosen.effect.amplitudes), 0.0, 0.0)
     odds = np.array([0.0, *(r.weight for r in found.values())])
     weights = np.exp(odds - np.logaddexp.reduce(odds))

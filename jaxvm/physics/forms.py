@@ -92,12 +92,14 @@ BASES: dict[str, Callable[[Course, Course, Constants], Course]] = {
     "ramp": lambda x, t, c: jnp.maximum(x - c[0], 0.0),
     "sine": lambda x, t, c: jnp.sin(2.0 * jnp.pi * x / c[0]),
     "cosine": lambda x, t, c: jnp.cos(2.0 * jnp.pi * x / c[0]),
+    "transient": lambda x, t, c: x - first_order_lag(x, t, c[0]),
+    "late onset": lambda x, t, c: -jnp.expm1(-jnp.maximum(x - c[0], 0.0) / jnp.maximum(c[1], 1e-9)),
     "bump": lambda x, t, c: bump(x, c[0], c[1]),
     **{f"knot {k}": _knot(k) for k in range(_MOST_KNOTS)},
 }
 """All bases by name. Those that use `t` remember the past and apply to time courses only."""
 
-_PLACED = ("step", "ramp", "bump", "play", *(f"knot {k}" for k in range(_MOST_KNOTS)))
+_PLACED = ("step", "ramp", "late onset", "bump", "play", *(f"knot {k}" for k in range(_MOST_KNOTS)))
 
 BASIS_INDEX = {name: index for index, name in enumerate(BASES)}
 
@@ -173,7 +175,14 @@ FORMS: dict[str, Form] = {
             "following {driver} with two time constants",
             centred=True,
         ),
+        Form("proportional", ("linear",), (), "in proportion to {driver} itself"),
         Form("rate", ("rate",), (), "in proportion to the rate of {driver}"),
+        Form(
+            "transient",
+            ("transient",),
+            (_TAU,),
+            "as far as {driver} is ahead of its own lag",
+        ),
         Form(
             "direction",
             ("direction",),
@@ -191,6 +200,12 @@ FORMS: dict[str, Form] = {
         Form("creep", ("log",), (_TAU,), "creeping with the logarithm of {driver}"),
         Form(
             "step", ("step",), (Constant("instant", "s", refined=False),), "suddenly, in {driver}"
+        ),
+        Form(
+            "settling",
+            ("late onset",),
+            (Constant("start", "s"), _TAU),
+            "settling exponentially from a moment in {driver} on",
         ),
         Form("ramp", ("ramp",), (Constant("start", "s"),), "steadily from a moment in {driver} on"),
         Form(

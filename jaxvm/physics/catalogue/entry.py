@@ -45,7 +45,7 @@ class Entry:
 THERMAL = ("linear", "lag", "two lags")
 """Forms of what follows a quantity, at once or late."""
 
-SETTLING = ("linear", "onset", "creep", "ramp")
+SETTLING = ("linear", "onset", "creep", "ramp", "settling")
 """Forms of what moves slowly one way."""
 
 ALWAYS = ("constant",)
@@ -58,11 +58,11 @@ def plain(*ports: str) -> Terms:
 
 
 def axes(*prefixes: str) -> tuple[Terms, ...]:
-    """Vector ports: all three components together, then each alone."""
+    """Vector ports: all three components together, the two across z, then each alone."""
     groups: tuple[Terms, ...] = ()
     for prefix in prefixes:
         names = [f"{prefix}_{axis}" for axis in "xyz"]
-        groups += (plain(*names), *map(plain, names))
+        groups += (plain(*names), plain(*names[:2]), *map(plain, names))
     return groups
 
 

@@ -36,14 +36,23 @@ LENS: tuple[Entry, ...] = (
         "principal distance changes by far more than lens and body can expand, or the other way.",
     ),
     Entry(
-        "focal-quadratic", "the focal length drifts out of proportion to the temperature", (80,),
+        "focal-sun", "the focal length follows the sun", (39, 82),
+        _FOCAL, ("irradiance",), THERMAL, "camera",
+        (1e-10, 1e-5), "a window that heats unevenly", "shade the camera; log its temperature",
+        "The sun warms lens and body beyond the temperature of the air. The principal distance "
+        "changes later than the sunlight by the time that the lens takes.",
+    ),
+    Entry(
+        "focal-quadratic", "the focal length drifts out of proportion to the temperature",
+        (39, 80),
         _FOCAL, ("temperature",), ("quadratic",), "camera",
         (5e-7, 1e-3), "a thermal drift with a lag", "a wide range of temperature",
         "Lens and body expand, and the glass changes its index, not quite in proportion to the "
         "temperature. Over a wide range the drift of the principal distance is a parabola.",
     ),
     Entry(
-        "focal-hysteresis", "the focal length does not return with the temperature", (79, 95),
+        "focal-hysteresis", "the focal length does not return with the temperature",
+        (39, 79, 95),
         _FOCAL, ("temperature",), ("hysteresis", "direction"), "camera",
         (5e-7, 1e-3), "a slow thermal lag", "slow cycles; always approach from one side",
         "Elements of the lens or its focus drive have backlash. The principal distance depends on "

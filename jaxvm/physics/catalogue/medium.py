@@ -44,7 +44,7 @@ MEDIUM: tuple[Entry, ...] = (
     ),
     Entry(
         "window-heats", "the window is a lens while it warms", (22,),
-        (plain("sensor.focal"),), ("temperature",), ("rate",), "camera",
+        (plain("sensor.focal"),), ("temperature",), ("rate", "transient"), "camera",
         (1e-6, 5e-4), "thermal drift of the focal length", "hold the temperature: it goes away",
         "While the temperature changes, middle and edge of the window or of the lens are not "
         "equally warm. The glass is a weak lens in proportion to the rate.",

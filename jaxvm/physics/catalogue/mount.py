@@ -16,14 +16,14 @@ MOUNT: tuple[Entry, ...] = (
     ),
     Entry(
         "mount-turn-quadratic", "the camera turns in its mount, more when far from its mean "
-        "temperature", (80,),
+        "temperature", (25, 80),
         _TURN, ("temperature",), ("quadratic",), "camera",
         (5e-7, 2e-4), "walk of the principal point", "a wide range of temperature",
         "Parts of different stuff distort the mount out of proportion when the temperature goes "
         "far. All targets shift in the image alike, at every range.",
     ),
     Entry(
-        "mount-hysteresis", "the camera turns in its mount with backlash", (79,),
+        "mount-hysteresis", "the camera turns in its mount with backlash", (25, 79),
         _TURN, ("temperature",), ("hysteresis", "direction"), "camera",
         (5e-7, 2e-4), "a slow thermal lag", "slow cycles: a lag shrinks, backlash does not",
         "Stick and slip in the mount make it return on another path than it went. The turn "
@@ -38,10 +38,17 @@ MOUNT: tuple[Entry, ...] = (
     ),
     Entry(
         "beam-warms-unevenly", "the beam under the camera bends while it warms", (27,),
-        _TURN, ("temperature",), ("rate", "direction"), "camera",
+        _TURN, ("temperature",), ("rate", "direction", "transient"), "camera",
         (1e-7, 1e-3), "backlash of the mount", "hold the temperature: the turn goes away",
         "While the temperature changes, surface and core or the two sides of the beam differ, and "
         "it bends. The turn follows the rate of the temperature and changes sign with it.",
+    ),
+    Entry(
+        "mount-turn-sun", "the camera turns in its mount in the sun", (25, 82),
+        _TURN, ("irradiance",), THERMAL, "camera",
+        (1e-9, 1e-5), "the beam under the camera bends", "shade the mount alone",
+        "The sun warms the mount beyond the temperature of the air, and it distorts. All targets "
+        "shift in the image alike, later than the sunlight by the time that the mount takes.",
     ),
     Entry(
         "mount-loaded", "the camera turns with a load or with its neighbour", (37,),
@@ -59,7 +66,7 @@ MOUNT: tuple[Entry, ...] = (
     ),
     Entry(
         "mount-creep", "the mount creeps", (28,),
-        _TURN, ("time",), ("onset", "creep", "linear"), "camera",
+        _TURN, ("time",), SETTLING, "camera",
         (1e-9, 1e-2), "thermal lag", "let the temperature return: creep does not",
         "The mount relaxes after it was set up. The camera turns ever more slowly in one "
         "direction.",
@@ -107,7 +114,7 @@ MOUNT: tuple[Entry, ...] = (
         "targets shift more than far ones.",
     ),
     Entry(
-        "bracket-hysteresis", "the camera's bracket moves with backlash", (79,),
+        "bracket-hysteresis", "the camera's bracket moves with backlash", (26, 79),
         _SHIFT, ("temperature",), ("hysteresis", "direction"), "camera",
         (2e-7, 2e-4), "a slow thermal lag", "slow cycles: a lag shrinks, backlash does not",
         "Joints of the bracket stick and slip as it grows and shrinks. The camera's place depends "

@@ -31,7 +31,7 @@ RANGE: tuple[Entry, ...] = (
         "more slowly.",
     ),
     Entry(
-        "range-jump", "the rangefinder's index jumps", (91,),
+        "range-jump", "the rangefinder's index jumps", (86, 91),
         _INDEX, ("time",), ("step",), "rangefinder",
         (1e-4, 2e-2), "motion of the target", "a fixed baseline",
         "The surface, the prism constant or the set-up of the rangefinder changed at one moment. "

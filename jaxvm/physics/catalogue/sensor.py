@@ -15,7 +15,7 @@ SENSOR: tuple[Entry, ...] = (
     ),
     Entry(
         "principal-point-quadratic", "the principal point walks out of proportion to the "
-        "temperature", (80,),
+        "temperature", (51, 80),
         _CENTRE, ("temperature",), ("quadratic",), "camera",
         (1e-3, 5e-1), "turn of the camera", "a wide range of temperature",
         "The sensor moves against the lens, not quite in proportion to the temperature. Over a "
@@ -23,14 +23,14 @@ SENSOR: tuple[Entry, ...] = (
     ),
     Entry(
         "principal-point-hysteresis", "the principal point does not return with the temperature",
-        (79,),
+        (51, 79),
         _CENTRE, ("temperature",), ("hysteresis", "direction"), "camera",
         (1e-3, 5e-1), "backlash of the mount", "slow cycles, a rolled camera",
         "Sensor or lens stick and slip as the body warms and cools. The image shifts and returns "
         "on another path.",
     ),
     Entry(
-        "principal-point-sun", "the sun on the housing shifts the image", (82,),
+        "principal-point-sun", "the sun on the housing shifts the image", (51, 82),
         _CENTRE, ("irradiance",), ("lag", "two lags"), "camera",
         (2e-5, 1e-2), "bias of the detector with the light", "shade the camera",
         "The sun heats the housing above the air and the sensor moves against the lens. The whole "
@@ -58,7 +58,7 @@ SENSOR: tuple[Entry, ...] = (
         "image window. The whole image shifts.",
     ),
     Entry(
-        "principal-point-ages", "the principal point drifts with age", (85,),
+        "principal-point-ages", "the principal point drifts with age", (51, 85),
         _CENTRE, ("time",), ("linear", "creep"), "camera",
         (1e-8, 5.0), "creep of the mount", "a rolled camera; calibrate again later",
         "Adhesive and screws around the sensor relax with time. The whole image drifts in one "
@@ -98,7 +98,7 @@ SENSOR: tuple[Entry, ...] = (
     ),
     Entry(
         "aspect", "the pixels are not square", (56, 96),
-        (plain("sensor.aspect"),), ALWAYS, ALWAYS, "camera",
+        (plain("sensor.aspect"), plain("sensor.aspect", "sensor.skew")), ALWAYS, ALWAYS, "camera",
         (1e-6, 1e-2), "scales of the target", "roll the target or the camera by 90 degrees",
         "The scales along rows and columns differ. Digital sensors have square pixels unless the "
         "image was resampled or its lines are timed by a wrong clock.",
@@ -139,13 +139,13 @@ SENSOR: tuple[Entry, ...] = (
     ),
     Entry(
         "exposure-delay", "the delay follows the exposure time", (62, 71),
-        _DELAY, ("exposure",), ("linear",), "camera",
+        _DELAY, ("exposure",), ("proportional", "linear"), "camera",
         (1e-4, 2e-3), "trigger offset", "hold the exposure, reverse the motion",
         "A moving mark is seen at the middle of the exposure, while the time stamp is that of its "
         "start. The delay is about half the exposure time.",
     ),
     Entry(
-        "rolling-shutter", "the shutter rolls", (58,),
+        "rolling-shutter", "the shutter rolls", (58, 96),
         (plain("shutter.row_time"),), ALWAYS, ALWAYS, "camera",
         (5e-4, 1e-1), "skew of the sensor", "a static scene, motion the other way",
         "The rows are exposed one after another. Moving targets are sheared or stretched, and the "

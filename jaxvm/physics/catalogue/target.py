@@ -51,7 +51,8 @@ TARGET: tuple[Entry, ...] = (
     Entry(
         "target-bends", "the target bends with its surroundings", (7,),
         pair("target.bow_x", "target.bow_y"),
-        ("temperature", "humidity", "irradiance", "quantity"), (*THERMAL, "rate"), "target",
+        ("temperature", "humidity", "irradiance", "quantity"),
+        (*THERMAL, "rate", "transient"), "target",
         (1e-8, 1e-3), "drift of the lens distortion", "watch a second target",
         "One-sided warming or moisture bends the plate. The bow follows the driver, often late.",
     ),
@@ -79,7 +80,7 @@ TARGET: tuple[Entry, ...] = (
     ),
     Entry(
         "target-scale-lags", "the target's scale follows the rate of the temperature", (97,),
-        (plain("target.scale"),), ("temperature",), ("rate",), "target",
+        (plain("target.scale"),), ("temperature",), ("rate", "transient"), "target",
         (1e-7, 1e-4), "thermal expansion, drift of the focal length",
         "a sensor on the target itself",
         "The logged temperature is not that of the plate or of the scale bar, which warm up later. "
