@@ -171,12 +171,17 @@ def _flat(base, factor, column, active, x):
 def _whitened(raw: list[Linearised], whiten, steps, per_parameter) -> list[Linearised]:
     result = []
     for table, (weight, sigma), (slots, effects, live) in zip(raw, whiten, steps, strict=True):
+        # What is set aside counts nothing, even where it can't be predicted at all.
+        used = (weight > 0.0)[:, None]
         scale = weight[:, None] / sigma
+        value, jacobian, tangent = (
+            jnp.where(used if part.ndim == 2 else used[:, :, None], part, 0.0) for part in table
+        )
         n = slots.shape[0]
         every = jnp.concatenate([slots, jnp.broadcast_to(effects, (n, len(effects)))], axis=1)
         step = per_parameter[every[:, jnp.asarray(live, int)]]
-        jacobian = table.jacobian * scale[:, :, None] * step[:, None, :]
-        result.append(Linearised(table.value * scale, jacobian, table.tangent * scale[:, :, None]))
+        jacobian = jacobian * scale[:, :, None] * step[:, None, :]
+        result.append(Linearised(value * scale, jacobian, tangent * scale[:, :, None]))
     return result
 
 
