@@ -6,11 +6,10 @@ import numpy as np
 
 from jaxvm.discover.heldout import Gain, HeldOut, Split, gain
 from jaxvm.discover.hypotheses import Hypothesis
-from jaxvm.discover.select import Candidate, identity, refit
+from jaxvm.discover.select import MANY, Candidate, identity, refit
 from jaxvm.solve.adjust import Adjustment
 
 _CANDIDATES = 4
-_WIDE = 8
 _NEAR = 30.0
 _TIE = 0.05
 _OPEN = 100.0, 0.02
@@ -50,10 +49,10 @@ def accept(
     for some in (near, rest[:_CANDIDATES]):
         refitted: list[Candidate] = []
         # Free forms come last: what a name explains as well needs no wide fit.
-        for hypothesis, foretold, amplitudes in sorted(some, key=lambda item: len(item[2]) > _WIDE):
+        for hypothesis, foretold, amplitudes in sorted(some, key=lambda item: len(item[2]) > MANY):
             key = (identity(hypothesis), hypothesis.course)
             best = max((c.evidence for c in refitted), default=-np.inf)
-            if key in hopeless or (len(amplitudes) > _WIDE and foretold < best):
+            if key in hopeless or (len(amplitudes) > MANY and foretold < best):
                 continue
             candidate = refit(current, hypothesis, amplitudes, split)
             if candidate is None or candidate.evidence <= 0.0:

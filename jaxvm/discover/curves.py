@@ -73,6 +73,11 @@ def image_map() -> tuple[Term, ...]:
     return _tiles("detect.u", "image", 5, 4) + _tiles("detect.v", "image", 5, 4)
 
 
+def fine_image_map() -> tuple[Term, ...]:
+    """The same with finer tiles, for dents and fringes."""
+    return _tiles("detect.u", "fine image", 9, 7) + _tiles("detect.v", "fine image", 9, 7)
+
+
 def plate_map() -> tuple[Term, ...]:
     """A smooth surface by which a plate stands off its plane."""
     return _tiles("target.point_z", "plate", 5, 5)

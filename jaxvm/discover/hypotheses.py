@@ -11,10 +11,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaxvm.discover.curves import CURVED, CURVED_FAST, curved_drivers, image_map, plate_map
+from jaxvm.discover.curves import (
+    CURVED,
+    CURVED_FAST,
+    curved_drivers,
+    fine_image_map,
+    image_map,
+    plate_map,
+)
 from jaxvm.network.scene import Scene
 from jaxvm.physics.catalogue import CATALOGUE, Entry, entries_for
-from jaxvm.physics.catalogue.lens import RINGS
+from jaxvm.physics.catalogue.lens import FINE_RINGS, RINGS
 from jaxvm.physics.drivers import channel_kind
 from jaxvm.physics.effects import Effect, Scope, Term
 from jaxvm.physics.forms import FORMS
@@ -158,6 +165,7 @@ class Hypothesis:
 
 _MAPS = {
     "image": "the detector errs by a smooth map over the image",
+    "fine image": "the detector errs by a map with fine detail over the image",
     "plate": "the target stands off its plane by a smooth surface",
 }
 
@@ -216,6 +224,7 @@ def enumerate_hypotheses(scene: Scene) -> tuple[Family, ...]:
         (_of_size(moving, 3), by_bases[1]),
         (marks, _courses_of_marks(courses, len(marks))),
         ([Group(RINGS, "camera")], constant),
+        ([Group(FINE_RINGS, "camera")], constant),
         *_free_forms(scene, constant),
     ]
     families = (_family(scene, groups, own, scopes) for groups, own in candidates if groups and own)
@@ -382,6 +391,7 @@ def _free_forms(scene: Scene, constant: list[Course]):
             ]
             yield groups, curves
     yield [Group(image_map(), "camera")], constant
+    yield [Group(fine_image_map(), "camera")], constant
     yield [Group(plate_map(), "target")], constant
 
 

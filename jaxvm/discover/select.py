@@ -33,6 +33,9 @@ CLEAR = 15.0
 
 _RTOL, _MAX_STEPS = 1e-6, 14
 
+MANY = 8
+"""A hypothesis with more columns than this is a free form: a curve or a map."""
+
 UNNAMED_PRIOR = 0.01
 """Weight of a hypothesis that no engineer has a name for, against one of the catalogue."""
 
@@ -92,10 +95,18 @@ def best_named(hypothesis: Hypothesis, amplitudes: np.ndarray) -> Hypothesis:
 def evidence(
     hypothesis: Hypothesis, drop: float, amplitudes: np.ndarray, variance: float, n: int
 ) -> float:
-    """Evidence of a hypothesis from its drop of chi-square."""
-    unknowns = len(amplitudes) + len(hypothesis.course.constants)
+    """Evidence of a hypothesis from its drop of chi-square.
+
+    Of a map with many tiles each knows little: their prior has the width that the tiles themselves
+    show (empirical Bayes), and costs 1 + ln(drop / columns) for each of them, which is less than
+    the ln n of a single unknown.
+    """
+    columns, constants = len(amplitudes), len(hypothesis.course.constants)
+    price = np.log(n)
+    if columns > MANY and hypothesis.course.form == "constant":
+        price = min(price, 1.0 + np.log(max(drop / variance / columns, 1.0)))
     prior = log_prior(hypothesis, np.asarray(amplitudes))
-    return drop / variance - unknowns * np.log(n) + 2.0 * prior
+    return drop / variance - columns * price - constants * np.log(n) + 2.0 * prior
 
 
 def identity(hypothesis: Hypothesis) -> tuple:

@@ -53,6 +53,7 @@ OBSERVATION_DRIVERS: dict[str, str] = {
 
 PLANES: dict[str, tuple[str, str, float]] = {
     "image": ("image_x", "image_y", 0.4),
+    "fine image": ("image_x", "image_y", 0.22),
     "plate": ("target_x", "target_y", 0.5),
 }
 """Two observation-like drivers together, and the spacing of the tiles of a map over them."""

@@ -1,13 +1,20 @@
 """Named physics of lenses: principal distance, distortion, decentring, pupil."""
 
-from jaxvm.physics.catalogue.entry import ALWAYS, THERMAL, Entry, pair, plain
+from jaxvm.physics.catalogue.entry import ALWAYS, THERMAL, Entry, Terms, pair, plain
 from jaxvm.physics.effects import Term
 
 _FOCAL, _RADIAL = (plain("sensor.focal"),), (plain("lens.k1"),)
 _DECENTRING = pair("lens.p1", "lens.p2")
 
-RINGS = tuple(Term("sensor.focal", "radius", "bump", (k / 6.0, 1.0 / 6.0)) for k in range(7))
-"""A free-form curve of the principal distance over the radius."""
+
+def _rings(count: int) -> Terms:
+    """Bumps of the principal distance over the radius, from the axis to the corner."""
+    width = 1.0 / (count - 1)
+    return tuple(Term("sensor.focal", "radius", "bump", (k * width, width)) for k in range(count))
+
+
+RINGS, FINE_RINGS = _rings(7), _rings(16)
+"""Free-form curves of the principal distance over the radius."""
 
 _RADIAL_FIXED = (
     tuple(Term("sensor.focal", "radius", basis) for basis in ("square", "fourth", "sixth")),
@@ -17,6 +24,7 @@ _RADIAL_FIXED = (
     plain("lens.k2"),
     plain("lens.k3"),
     RINGS,
+    FINE_RINGS,
 )
 
 LENS: tuple[Entry, ...] = (
