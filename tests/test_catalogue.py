@@ -97,6 +97,9 @@ ALIKE = (
     {"radial-beyond-model", "coma"},
     # A wedge or a dome bends the image as a decentred lens does.
     {"decentring", "window-off-centre"},
+    # The sun bends what carries the camera, mount or beam; it changes the lens or its window.
+    {"camera-on-bent-beam", "mount-turn-sun"},
+    {"window-lens-power", "focal-sun"},
     # Both are a delay from one moment on.
     {"frame-slip", "trigger-late"},
 )
@@ -121,7 +124,7 @@ def test_the_kind_of_a_channel_decides_the_name():
         "device-compensates",
     ]
     assert names(focal, "quantity", "linear", "pressure") == ["focal-pressure"]
-    assert names(focal, "quantity", "linear", "irradiance") == ["window-lens-power"]
+    assert names(focal, "quantity", "linear", "irradiance") == ["window-lens-power", "focal-sun"]
     # A load does not heat a lens, but it bends a mount.
     assert (
         names(focal, "quantity", "linear", "quantity") == names(focal, "quantity", "linear") == []

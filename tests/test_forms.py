@@ -187,6 +187,7 @@ X = np.array([-3.0, -0.5, 0.0, 0.7, 2.0, 4.0])
 T = np.array([0.0, 600.0, 1800.0, 2400.0, 3600.0, 7200.0])
 EXPECTED = {  # with the constants 2 and 0.5, written without the package
     "one": np.ones(6),
+    "late onset": np.where(X > 2.0, 1.0 - np.exp(-(X - 2.0) / 0.5), 0.0),
     "linear": X,
     "square": X * X,
     "cube": X * X * X,
@@ -215,12 +216,14 @@ def test_basis_by_hand(name):
 
 def test_two_lags_read_their_own_constants():
     constants = jnp.array([800.0, 4000.0])
+    ahead = BASES["transient"](X, T, constants)
+    np.testing.assert_allclose(ahead, X - lag(X, T, 800.0), rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(BASES["lag"](X, T, constants), lag(X, T, 800.0), rtol=1e-13)
     np.testing.assert_allclose(BASES["slow lag"](X, T, constants), lag(X, T, 4000.0), rtol=1e-13)
 
 
 def test_every_basis_is_checked_here():
-    assert set(EXPECTED) | {"lag", "slow lag"} == set(BASES)
+    assert set(EXPECTED) | {"lag", "slow lag", "transient"} == set(BASES)
 
 
 @pytest.mark.parametrize("name", BASES)

@@ -24,7 +24,7 @@ def test_a_mistake_is_no_physics_and_physics_no_mistake(tmp_path):
     assert found.n_rejected == 1 and found.verdict == "consistent", summary(found)
     same = (obs.target == obs.target[wrong]) & (obs.point == obs.point[wrong])
     pixel = obs.pixel.copy()
-    pixel[same & (obs.camera == 0)] += [2.0, 0.0]
+    pixel[same] += [2.0, 0.0]
     found = diagnose(replace(recording, observations=replace(obs, pixel=pixel)))
     assert found.n_rejected == 0 and found.findings, summary(found)
     target = recording.model.targets[obs.target[wrong]]

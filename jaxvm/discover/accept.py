@@ -11,6 +11,13 @@ from jaxvm.solve.adjust import Adjustment
 
 _CANDIDATES = 4
 _NEAR = 30.0
+
+STRONG = 20.0
+"""Evidence at which what never changes needs held-out epochs only not to speak against it.
+
+It can't follow the noise of single epochs, and the held-out third alone shows a weak effect badly.
+"""
+
 _TIE = 0.05
 _OPEN = 100.0, 0.02
 
@@ -46,6 +53,7 @@ def accept(
     least = leading[0][1] - max(_NEAR, _TIE * abs(leading[0][1]))
     near = [item for item in leading[:_CANDIDATES] if item[1] >= least]
     rest = [item for item in leading[len(near) :] if item[0].entries]
+    tried: list[Candidate] = []
     for some in (near, rest[:_CANDIDATES]):
         refitted: list[Candidate] = []
         # Free forms come last: what a name explains as well needs no wide fit.
@@ -55,21 +63,23 @@ def accept(
             if key in hopeless or (len(amplitudes) > MANY and foretold < best):
                 continue
             candidate = refit(current, hypothesis, amplitudes, split)
+            tried += [] if candidate is None else [candidate]
             if candidate is None or candidate.evidence <= 0.0:
                 hopeless.add(key)
             else:
                 refitted.append(candidate)
         for candidate in sorted(refitted, key=lambda c: -_common_evidence(c, refitted, current)):
-            tried = split.evaluate(candidate.adjustment.scene)
-            proof = gain(heldout, tried, seed)
-            if proof.proven:
+            shown = split.evaluate(candidate.adjustment.scene)
+            proof = gain(heldout, shown, seed)
+            fixed = candidate.hypothesis.course.driver == "constant"
+            if proof.proven or (fixed and candidate.evidence > STRONG and proof.probability > 0.5):
                 gap = max(_OPEN[0], _OPEN[1] * abs(candidate.evidence))
                 others = tuple(
                     c
                     for c in sorted(refitted, key=lambda c: -c.evidence)
                     if c is not candidate and candidate.evidence - c.evidence < gap
                 )
-                return Accepted(candidate, others, tried, proof, tuple(refitted))
+                return Accepted(candidate, others, shown, proof, tuple(tried))
             hopeless.add((identity(candidate.hypothesis), candidate.hypothesis.course))
     return short(leading[0][0])
 

@@ -257,7 +257,8 @@ def rivals(
     foretold = [own for h, own, _ in leading if h.same(chosen.hypothesis)]
     for hypothesis, own, amplitudes in leading if foretold else ():
         behind = max(foretold[0] - own, 0.0)
-        if behind <= DECIDED and not any(r.same(hypothesis) for r in refitted):
+        named = bool(hypothesis.entries)
+        if named and behind <= DECIDED and not any(r.same(hypothesis) for r in refitted):
             prior = log_prior(hypothesis, np.asarray(amplitudes)) - own_prior
             weigh(hypothesis, amplitudes, behind, -0.5 * behind - prior)
     weigh(chosen.hypothesis, np.asarray(chosen.effect.amplitudes), 0.0, 0.0)

@@ -153,7 +153,7 @@ LENS: tuple[Entry, ...] = (
     ),
     Entry(
         "coma", "the spots are smeared outward", (72,),
-        _RADIAL_FIXED, ALWAYS, ALWAYS, "camera",
+        (*_RADIAL_FIXED, (Term("sensor.focal", "radius", "linear"),)), ALWAYS, ALWAYS, "camera",
         (1e-6, 5e-2), "radial distortion", "another aperture or focus; look at the spots",
         "Coma or defocus makes the image of a mark lopsided, more so towards the edge. Its "
         "centroid moves along the radius, as if the lens distorted.",

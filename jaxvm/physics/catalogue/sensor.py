@@ -98,7 +98,11 @@ SENSOR: tuple[Entry, ...] = (
     ),
     Entry(
         "aspect", "the pixels are not square", (56, 96),
-        (plain("sensor.aspect"), plain("sensor.aspect", "sensor.skew")), ALWAYS, ALWAYS, "camera",
+        (
+            plain("sensor.aspect"),
+            plain("sensor.aspect", "sensor.skew"),
+            plain("sensor.aspect", "sensor.focal"),
+        ), ALWAYS, ALWAYS, "camera",
         (1e-6, 1e-2), "scales of the target", "roll the target or the camera by 90 degrees",
         "The scales along rows and columns differ. Digital sensors have square pixels unless the "
         "image was resampled or its lines are timed by a wrong clock.",
