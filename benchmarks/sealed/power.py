@@ -18,11 +18,12 @@ from names import Facts
 from scipy.spatial.transform import Rotation
 
 from jaxvm.discover.cells import Arrangement, Cells, arrange
-from jaxvm.discover.diagnose import FLIPS, ROOM
+from jaxvm.discover.diagnose import ROOM
 from jaxvm.discover.gross import without_gross_errors
 from jaxvm.discover.heldout import Split, hold_out, split
 from jaxvm.discover.hypotheses import enumerate_hypotheses, member
 from jaxvm.discover.score import Battery, Ranking, battery, score_residuals
+from jaxvm.discover.search import FLIPS
 from jaxvm.network.residual import whitening
 from jaxvm.network.scene import Scene, build
 from jaxvm.network.start import start

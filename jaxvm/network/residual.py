@@ -4,7 +4,7 @@ Simulation, adjustment, covariance, Monte Carlo and diagnosis all call what stan
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -201,8 +201,8 @@ def linearise(
         table = (by_ports, factor.epoch, factor.pattern)
         by_effects = by_blocks(_by_effects, table, acting, roomy(slopes, axis=1), owner)
         by_effects = by_effects[:, :, np.asarray(wanted)]
-    joined = np.concatenate if isinstance(by_own, np.ndarray) else jnp.concatenate
-    return Linearised(value, joined([by_own, by_effects], axis=2), by_ports)
+    joined: Any = np if isinstance(by_own, np.ndarray) else jnp
+    return Linearised(value, joined.concatenate([by_own, by_effects], axis=2), by_ports)
 
 
 def _owners(effects: EffectTable, n: int) -> Float[Array, "columns 2 constants"]:

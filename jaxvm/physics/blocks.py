@@ -7,9 +7,11 @@ table would serve recordings of that very size alone. Under a transformation of 
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import numpy as np
+from jax.core import Tracer
 
 BLOCK = 1024
 """Rows of a block."""
@@ -20,17 +22,17 @@ _SMALL = 64
 
 def traced(*values) -> bool:
     """Whether a transformation of JAX is under way on any of the arrays."""
-    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
 
 
-def hosted(*arrays):
+def hosted(*arrays) -> Any:
     """Arrays as NumPy's where no transformation is under way: indexing them compiles nothing."""
     if traced(arrays) or jax.default_backend() != "cpu":
         return arrays
     return tuple(np.asarray(array) for array in arrays)
 
 
-def by_blocks(function: Callable, table, *common, size: int | None = None):
+def by_blocks(function: Callable, table, *common, size: int | None = None) -> Any:
     """`function(table, *common)`, computed block by block of the table's rows.
 
     Args:

@@ -9,7 +9,7 @@ average out.)
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -192,18 +192,19 @@ def pattern(
 ) -> Float[Array, " observations"]:
     """Pattern of one term over a table of observations; 0 where its driver has no meaning (NaN)."""
     constants = np.array((*term.constants, 1.0, 1.0)[:2], float)
-    (drivers,) = hosted(drivers)
+    (table,) = hosted(drivers)
     if term.driver in PLANES:
         x_name, y_name, width = PLANES[term.driver]
         columns = [OBSERVATION_DRIVER_INDEX[name] for name in (x_name, y_name)]
-        x = drivers[:, np.array(columns)]
+        x = table[:, np.array(columns)]
         evaluate, known = partial(_spot, width=width), jnp.isfinite(x).all(axis=1)
     else:
-        x = drivers[:, OBSERVATION_DRIVER_INDEX[term.driver]]
+        x = table[:, OBSERVATION_DRIVER_INDEX[term.driver]]
         evaluate, known = partial(_basis, name=term.basis), jnp.isfinite(x)
     (known,) = hosted(known)
     values = by_blocks(evaluate, x, constants)
-    return (np if isinstance(values, np.ndarray) else jnp).where(known, values, 0.0)
+    where: Any = np.where if isinstance(values, np.ndarray) else jnp.where
+    return where(known, values, 0.0)
 
 
 @partial(jax.jit, static_argnames="name")

@@ -14,6 +14,7 @@ target, how the row or the radius enters) is a table.
 
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -254,7 +255,7 @@ def evaluate(rows, channels: Channels) -> Float[Array, "n epochs"]:
     return _by_kinds(_at_epochs, rows, channels)
 
 
-def _by_kinds(function, rows, channels: Channels):
+def _by_kinds(function, rows, channels: Channels) -> Any:
     """A function of courses at the epochs, evaluated for those of one kind of basis at once."""
     n, grid = len(channels.epoch_time), (channels.time, channels.epoch_time)
     if traced(rows, grid) or not len(rows[0]):

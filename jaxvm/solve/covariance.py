@@ -17,6 +17,7 @@ from jaxvm.network.state import State
 from jaxvm.solve.adjust import Adjustment
 from jaxvm.solve.arrow import ArrowFactors, factorise
 from jaxvm.solve.problem import Problem, normal_at
+from jaxvm.solve.snooping import robust_variance
 
 
 def covariance(
@@ -84,6 +85,19 @@ def standard_deviations(adjustment: Adjustment, scale: float = 1.0) -> State:
     """Standard deviation of every parameter of the state; zero where it is held."""
     flat = _marginals(adjustment.problem, _factors(adjustment))
     return adjustment.problem.network.layout.restore(jnp.sqrt(scale) * flat)
+
+
+def effect_deviations(adjustment: Adjustment) -> list[tuple[float, ...]]:
+    """Standard deviations of every effect: its amplitudes, then its constants.
+
+    The variance of unit weight is that of the residuals, robustly estimated.
+    """
+    deviations = standard_deviations(adjustment, robust_variance(adjustment))
+    amplitude, constant = np.asarray(deviations.amplitude), np.asarray(deviations.constant)
+    return [
+        tuple(map(float, (*amplitude[columns], *constant[constants])))
+        for columns, constants in adjustment.scene.places()
+    ]
 
 
 @eqx.filter_jit

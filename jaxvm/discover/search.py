@@ -1,0 +1,234 @@
+"""The search: score, test, refit, prove, and again, until nothing significant is left."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from jaxvm.discover.accept import Accepted, accept, short
+from jaxvm.discover.cells import Arrangement, arrange
+from jaxvm.discover.diagnosis import Finding
+from jaxvm.discover.heldout import HeldOut, Split
+from jaxvm.discover.hypotheses import enumerate_hypotheses
+from jaxvm.discover.noise import LONGEST, memory, multipliers
+from jaxvm.discover.revise import prune, rename
+from jaxvm.discover.score import Battery, Ranking, battery, score_residuals
+from jaxvm.discover.select import refit, rivals, shortlist, stacked
+from jaxvm.solve.adjust import Adjustment
+from jaxvm.solve.covariance import effect_deviations
+from jaxvm.solve.snooping import robust_variance
+
+ALPHA = 0.01
+"""Family-wise probability to claim something where nothing is hidden."""
+
+FLIPS = 199
+"""Repetitions of the null distribution."""
+
+
+@dataclass
+class Search:
+    """Where the search stands.
+
+    Attributes:
+        parts: what is fitted and what is held out.
+        current: the fit with everything found so far.
+        heldout: its errors on the held-out epochs.
+        given: number of effects that the engineer's model has itself.
+        alpha: family-wise probability of a false claim.
+        seed: of sign-flips and bootstrap.
+        findings: what was found.
+        p_value: family-wise p-value of the best hypothesis that is left.
+        unproven: the significant one that did not pass on the held-out epochs, in words.
+        ranking: the last scores of all hypotheses.
+    """
+
+    parts: Split
+    current: Adjustment
+    heldout: HeldOut
+    given: int
+    alpha: float = ALPHA
+    seed: int = 0
+    findings: list[Finding] = field(default_factory=list)
+    p_value: float = 1.0
+    unproven: str = ""
+    ranking: Ranking = field(init=False)
+    _arrangement: Arrangement = field(init=False)
+    _asked: Battery = field(init=False)
+    _signs: np.ndarray = field(init=False)
+    _hopeless: set = field(default_factory=set)
+
+    def __post_init__(self) -> None:
+        self._signs = multipliers(len(self.parts.held), 1, FLIPS, self.seed)
+        self._arrangement = arrange(self.current)
+        families = enumerate_hypotheses(self.current.scene)
+        self._asked = battery(self.current.scene, self._arrangement, families)
+
+    def run(self, most: int, progress: Callable[[str], None]) -> None:
+        """Search until nothing significant is left, at most so many findings are made."""
+        while True:
+            progress(f"scoring hypotheses (round {len(self.findings) + 1})")
+            foremost = self._score()
+            if self.p_value > self.alpha or len(self.findings) == most:
+                break
+            leading = [
+                item
+                for item in foremost
+                if not any(item[0].covered(f.hypothesis) for f in self.findings)
+            ]
+            if not leading:
+                self.unproven = "what an unnamed effect left over"
+                break
+            number = self.ranking.n
+            progress(f"{number} hypotheses, p = {self.p_value:.3g}: refitting the leading ones")
+            accepted = accept(
+                self.current, leading, self.parts, self.heldout, self.seed, self._hopeless
+            )
+            if isinstance(accepted, str):
+                self.unproven = accepted
+                break
+            effect = accepted.chosen.effect
+            self._take(accepted, leading)
+            progress(f"found: {effect.name} ({effect.scope.words()})")
+            if len(self.findings) > 1 and min(f.p_value for f in self.findings[-2:]) > self.alpha:
+                break
+        self._settle()
+
+    def _score(self):
+        """Score all hypotheses; the leading ones."""
+        current = self.current
+        variance = robust_variance(current)
+        self._arrangement = arrange(current)
+        self.ranking = self._scores(variance, self._signs)
+        foremost = shortlist(self.ranking, current.scene, variance, self.parts.n, 12)
+        self.p_value = self.ranking.p_value(self.ranking.best_z())
+        if self.p_value > self.alpha and foremost:
+            self.p_value = self._p_without(*foremost[0][::2])
+        return foremost
+
+    def _scores(self, variance: float, signs: np.ndarray, residual=None) -> Ranking:
+        return score_residuals(
+            self.current.scene, self._arrangement, self._asked, variance, signs, residual
+        )
+
+    def _p_without(self, hypothesis, amplitudes) -> float:
+        """The family-wise p-value of the best hypothesis, under what is left when it is fitted.
+
+        A strong effect in few epochs is in the null distribution, too: under flipped signs
+        something always follows it. What noise alone can't give is judged by the noise that is
+        left over.
+        """
+        z = self.ranking.best_z()
+        if z < 2.0 * np.log(self.ranking.n / self.alpha):
+            return self.p_value
+        without = refit(self.current, hypothesis, amplitudes, self.parts)
+        if without is None:
+            return self.p_value
+        variance = robust_variance(without.adjustment)
+        return self._scores(variance, self._signs, stacked(without.adjustment)).p_value(z)
+
+    def _take(self, accepted: Accepted, leading) -> None:
+        """Take an accepted hypothesis into the model, and look at the earlier findings again."""
+        parts = self.parts
+        finding = self._finding(accepted, leading)
+        former = [*self.findings, finding]
+        self.heldout = accepted.heldout
+        current = replace(accepted.chosen.adjustment, scene=accepted.heldout.scene)
+        self.current, self.findings = prune(current, former, parts.n, parts.fit)
+        if len(self.findings) < len(former):
+            self.current, self.heldout = parts.proven(self.current)
+            self.findings = self._with_heir(former)
+        self.findings = self._confirmed()
+
+    def _finding(self, accepted: Accepted, leading) -> Finding:
+        chosen, parts, current = accepted.chosen, self.parts, self.current
+        weight, doubles = rivals(
+            current.scene,
+            self._arrangement,
+            self._asked,
+            accepted,
+            leading,
+            current,
+            parts.n,
+            self._signs,
+        )
+        return Finding(
+            hypothesis=chosen.hypothesis,
+            effect=chosen.effect,
+            stds=effect_deviations(chosen.adjustment)[-1],
+            final_effect=chosen.effect,
+            final_stds=(),
+            weight=weight,
+            rivals=tuple(doubles[:8]),
+            p_value=self.p_value,
+            p_independent=self.p_value,
+            z=self.ranking.best_z(),
+            n_hypotheses=self.ranking.n,
+            drop=2.0 * (current.cost - chosen.adjustment.cost),
+            share=0.0,
+            before=parts.residuals(current),
+            after=parts.residuals(chosen.adjustment),
+            gain=accepted.gain,
+            ranking=tuple((short(h), e) for h, e, _ in leading),
+            doubles=tuple(candidate.hypothesis for candidate in accepted.near),
+            chosen=next(k for k, (h, *_) in enumerate(leading) if h.same(chosen.hypothesis)),
+        )
+
+    def _with_heir(self, former: list[Finding]) -> list[Finding]:
+        """Findings after some were dropped: what those showed, the strongest one shows now."""
+        findings = list(self.findings)
+        if not findings:
+            return findings
+        kept = {id(finding) for finding in findings}
+        lost = max(finding.z for finding in former if id(finding) not in kept)
+        effects, scene = self.current.scene.fitted_effects(), self.current.scene
+        without = (
+            scene.with_effects((*effects[:k], *effects[k + 1 :]), scene.room)
+            for k in range(len(effects) - len(findings), len(effects))
+        )
+        heir = int(np.argmax([self.parts.fit(scene).cost for scene in without]))
+        findings[heir] = replace(findings[heir], z=max(findings[heir].z, lost))
+        return findings
+
+    def _confirmed(self) -> list[Finding]:
+        """Findings with their p-values under noise that remembers as long as what is left now.
+
+        Noise with a memory looks like a smooth effect, and so does an effect that is not found yet:
+        that is why earlier findings are looked at again after each new one.
+        """
+        scene = self.current.scene
+        # Without a clock neighbours in the list are alike for other reasons (the board's attitude).
+        timed = scene.recording.timed
+        window = memory(scene, self.parts.residuals(self.current)) if timed else 1
+        if window == 1:
+            return [replace(f, p_value=f.p_independent) for f in self.findings]
+        n_epochs = len(scene.recording.time)
+        window = min(2 * window, max(int(LONGEST * n_epochs), 2))
+        remembering = multipliers(n_epochs, window, FLIPS, self.seed)
+        left = self._scores(robust_variance(self.current), remembering, stacked(self.current))
+        return [replace(f, p_value=max(left.p_value(f.z), f.p_independent)) for f in self.findings]
+
+    def _settle(self) -> None:
+        """Drop what noise with a memory explains, and give the findings their last names."""
+        parts = self.parts
+        unconfirmed = [f.p_value for f in self.findings if f.p_value > self.alpha]
+        if unconfirmed:
+            self.p_value = min(unconfirmed)
+            self._drop_unconfirmed()
+            self.current, self.heldout = parts.proven(self.current)
+        names = [finding.hypothesis for finding in self.findings]
+        if self.p_value > self.alpha:
+            # While something is left, names can't be decided better than when they were found.
+            self.current, self.findings = rename(self.current, self.findings, parts.n, parts.fit)
+        if [finding.hypothesis for finding in self.findings] != names:
+            self.current, self.heldout = parts.proven(self.current)
+            deviations = effect_deviations(self.current)[self.given :]
+            pairs = zip(self.findings, deviations, strict=True)
+            self.findings = [replace(f, stds=f.stds or own) for f, own in pairs]
+
+    def _drop_unconfirmed(self) -> None:
+        effects = self.current.scene.fitted_effects()
+        kept = [k for k, finding in enumerate(self.findings) if finding.p_value <= self.alpha]
+        effects = (*effects[: self.given], *(effects[self.given + k] for k in kept))
+        scene = self.current.scene
+        self.current = self.parts.fit(scene.with_effects(effects, scene.room))
+        self.findings = [self.findings[k] for k in kept]
