@@ -35,6 +35,8 @@ from jaxvm.physics.ports import PORT_INDEX
 
 _ABSORBED = 1e-8
 
+_MOST_PRODUCTS = 6_000_000
+
 FEWEST_EPOCHS = 3.0
 """A hypothesis that fewer epochs carry than this can't be told from a few bad images."""
 
@@ -255,13 +257,21 @@ class _Pairs:
     weights: Float[np.ndarray, "b bases cells"]
     by_group: Float[np.ndarray, "groups b_bases width"]
     by_epoch: Float[np.ndarray, "epochs b_bases wide"]
+    within: Float[np.ndarray, "b bases bases groups_width_width"] | None
+    """Products of the weights of two cells of one group; None where they would be too many."""
 
     @classmethod
     def of(cls, weights: np.ndarray, cells: Cells) -> "_Pairs":
         """Gathered by group and by epoch."""
         flat = weights.reshape(-1, weights.shape[2])
-        by_group = np.moveaxis(cells.by(cells.group, flat), 1, 0)
-        return cls(weights, by_group, np.moveaxis(cells.by(cells.epoch, flat), 1, 0))
+        by_group = cells.by(cells.group, flat)  # (b i) G w
+        by_epoch = np.moveaxis(cells.by(cells.epoch, flat), 1, 0)
+        within = None
+        b, n_bases, _ = weights.shape
+        if b * n_bases**2 * cells.group.size * cells.group.shape[1] <= _MOST_PRODUCTS:
+            own = by_group.reshape(b, n_bases, *cells.group.shape)
+            within = np.einsum("bigv,bjgw->bijgvw", own, own).reshape(b, n_bases, n_bases, -1)
+        return cls(weights, np.moveaxis(by_group, 1, 0), by_epoch, within)
 
 
 def _score_group(
@@ -309,6 +319,12 @@ def _score_group(
     information = gram - shared @ np.swapaxes(shared, 1, 2)
     if d:
         padded = np.concatenate([halves[:, :, :d], np.zeros((1, k, d))])[cells.group]
+    if d and pairs.within is not None:
+        alike = np.einsum("gvkd,gwld->gvwkl", padded, padded, optimize=True)
+        taken = pairs.within @ alike.reshape(-1, k * k)
+        taken = taken.reshape(b, n_bases, n_bases, k, k).transpose(0, 3, 1, 4, 2)
+        information -= taken.reshape(b, columns, columns)
+    elif d:
         local = pairs.by_group @ padded.reshape(*cells.group.shape, k * d)  # G (b i) (k d)
         local = np.moveaxis(local, 0, 1).reshape(b * n_bases, -1, k, d)
         local = by_terms(np.swapaxes(local, 1, 2)).reshape(b, columns, -1)
