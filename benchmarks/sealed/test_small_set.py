@@ -18,7 +18,7 @@ from jaxvm.discover import diagnose
 from jaxvm.recording import read_recording
 from jaxvm.report import document
 
-SEALED = Path(__file__).parents[1] / "benchmarks" / "sealed"
+SEALED = Path(__file__).parent
 SEED = 271828
 KINDS = "board", "stereo"
 COUNT, EMPTY = 30, 8
