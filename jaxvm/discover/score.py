@@ -317,8 +317,7 @@ def _score_group(
     of_shared = halves[:, :, d:]
     shared = by_terms((of_bases @ of_shared.reshape(n, -1)).reshape(-1, *of_shared.shape[1:]))
     information = gram - shared @ np.swapaxes(shared, 1, 2)
-    if d:
-        padded = np.concatenate([halves[:, :, :d], np.zeros((1, k, d))])[cells.group]
+    padded = np.concatenate([halves[:, :, :d], np.zeros((1, k, d))])[cells.group]
     if d and pairs.within is not None:
         alike = np.einsum("gvkd,gwld->gvwkl", padded, padded, optimize=True)
         taken = pairs.within @ alike.reshape(-1, k * k)
