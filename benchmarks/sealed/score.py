@@ -20,9 +20,6 @@ from tally import by_effect, figures, markdown
 
 HERE = Path(__file__).parent
 
-RECORDINGS_OF_A_PROCESS = 40
-"""After so many a worker is replaced: its compiled programs fill the memory."""
-
 
 def sealed_key(folder: Path) -> tuple[list[dict], str]:
     """Entries of key.json and its SHA-256.
@@ -53,9 +50,10 @@ def show(folder: Path, entry: dict) -> dict:
     from power import shown
 
     from jaxvm.recording import read_recording
-    from jaxvm.solve.compiling import keep_compiled
+    from jaxvm.solve.compiling import forget_compiled_if_many, keep_compiled
 
     keep_compiled()
+    forget_compiled_if_many()
     recording = read_recording(folder / "recordings" / entry["id"])
     return shown(recording, *sealed_changes(folder, entry), entry["noise"]).as_dict()
 
@@ -91,9 +89,8 @@ def shown_of_all(folder: Path, entries: list[dict], jobs: int, again: bool) -> d
         else:
             wanted.append(entry)
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(
-        jobs, mp_context=context, max_tasks_per_child=RECORDINGS_OF_A_PROCESS
-    ) as pool:
+    # Replacing workers after some tasks locks up Python 3.11's pool; they forget programs instead.
+    with ProcessPoolExecutor(jobs, mp_context=context) as pool:
         pending = {pool.submit(show, folder, entry): entry["id"] for entry in wanted}
         for count, future in enumerate(as_completed(pending), start=1):
             name = pending[future]
