@@ -14,7 +14,7 @@ from jaxvm.network.binding import observation_driver_table, range_driver_table
 from jaxvm.network.factors import PixelFactor, RangeFactor
 from jaxvm.solve.adjust import Adjustment
 from jaxvm.solve.arrow import Arrow, factorise
-from jaxvm.solve.problem import Problem, normal_at
+from jaxvm.solve.problem import Problem
 from jaxvm.solve.reduced import half_rows, packet_of_rows
 
 
@@ -57,16 +57,15 @@ class Arrangement:
     components: int
 
 
-def _whitened(problem: Problem, x, hessian: Arrow):
+def _whitened(problem: Problem, x):
     """Half rows, residuals and port tangents of all tables on which effects act."""
     tables = problem.linearised(x, tangent=True)
+    hessian = problem.assembled(tables).hessian
     n_effect = len(problem.network.pixels) + (problem.network.ranges is not None)
-    jacobians = [table.jacobian for table in tables[:n_effect]]
+    acting = tables[:n_effect]
+    jacobians = [table.jacobian for table in acting]
     halves = _half_rows(hessian, problem.packets[:n_effect], jacobians, problem.sizes)
-    return [
-        (half, table.value, table.tangent)
-        for half, table in zip(halves, tables[:n_effect], strict=True)
-    ]
+    return [(half, t.value, t.tangent) for half, t in zip(halves, acting, strict=True)]
 
 
 @eqx.filter_jit
@@ -78,7 +77,7 @@ def _half_rows(hessian: Arrow, packets, jacobians, sizes):
 def arrange(adjustment: Adjustment) -> Arrangement:
     """Arrange residuals and tangents of an adjusted scene in cells."""
     scene, problem = adjustment.scene, adjustment.problem
-    whitened = _whitened(problem, adjustment.x, normal_at(problem, adjustment.x).hessian)
+    whitened = _whitened(problem, adjustment.x)
     n_groups = problem.sizes[1]
     keys, drivers, halves, residuals, tangents, starts = [], [], [], [], [], []
     components = max(r.shape[1] for _, r, _ in whitened)
@@ -105,9 +104,9 @@ def arrange(adjustment: Adjustment) -> Arrangement:
             drivers.append(np.asarray(range_driver_table(scene, factor))[:n])
         keys.append(np.stack([group, np.asarray(factor.epoch)[:n], entity], axis=1))
         pad = [(0, 0), (0, components - r.shape[1])]
-        halves.append(np.pad(np.asarray(half)[:n], [*pad, (0, 0)]))
         residuals.append(np.pad(np.asarray(r)[:n], pad))
-        tangents.append(np.pad(np.asarray(tangent)[:n], [*pad, (0, 0)]))
+        for parts, own in ((halves, half), (tangents, tangent)):
+            parts.append(np.pad(np.asarray(own)[:n], [*pad, (0, 0)]))
     key = np.concatenate(keys)
     distinct, cell = np.unique(key, axis=0, return_inverse=True)
     rows = _padded_lists(cell.ravel(), len(distinct), len(key))
@@ -118,12 +117,12 @@ def arrange(adjustment: Adjustment) -> Arrangement:
         return values.reshape(len(distinct), rows.shape[1] * components, *values.shape[3:])
 
     cells = Cells(
-        tangent=(np.moveaxis(in_cells(tangents), 2, 0)),
-        residual=(in_cells(residuals)),
-        half=(in_cells(halves)),
-        group=(_padded_lists(distinct[:, 0], n_groups, len(distinct))),
-        group_of=(np.where(distinct[:, 0] < 0, n_groups, distinct[:, 0])),
-        epoch=(_padded_lists(distinct[:, 1], len(scene.recording.time), len(distinct))),
+        tangent=np.moveaxis(in_cells(tangents), 2, 0),
+        residual=in_cells(residuals),
+        half=in_cells(halves),
+        group=_padded_lists(distinct[:, 0], n_groups, len(distinct)),
+        group_of=np.where(distinct[:, 0] < 0, n_groups, distinct[:, 0]),
+        epoch=_padded_lists(distinct[:, 1], len(scene.recording.time), len(distinct)),
         n_local=problem.sizes[2],
     )
     return Arrangement(

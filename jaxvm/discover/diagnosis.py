@@ -8,8 +8,8 @@ from jaxvm.discover.advice import Advice
 from jaxvm.discover.heldout import Gain, HeldOut
 from jaxvm.discover.hypotheses import Hypothesis
 from jaxvm.discover.locate import Place, ResidualTable
+from jaxvm.discover.rivals import Rival
 from jaxvm.discover.scopes import Sharing
-from jaxvm.discover.select import Rival
 from jaxvm.network.scene import Scene
 from jaxvm.physics.effects import Effect
 from jaxvm.recording import Recording

@@ -1,8 +1,8 @@
 """The space of hypotheses: port x driver x form x scope, enumerated for one recording.
 
 A *group* is what enters where (terms), a *course* how it runs in time (driver, form, constants), a
-*scope* who has it. Groups of one size with courses of one size make a *family*; every member of a
-family is scored by the same compiled kernel.
+*scope* who has it. Groups of one size with courses of one size make a *family*; its members share
+the shapes of their products when they are scored.
 """
 
 import math

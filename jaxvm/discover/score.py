@@ -20,7 +20,6 @@ independence inside an epoch (wild bootstrap of the scores).
 import math
 from dataclasses import dataclass, replace
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -34,8 +33,10 @@ from jaxvm.physics.forms import BASIS_INDEX, FORMS
 from jaxvm.physics.ports import PORT_INDEX
 
 _ABSORBED = 1e-8
+"""Relative information below which a direction counts as absorbed by the model."""
 
 _MOST_PRODUCTS = 6_000_000
+"""Numbers that products of the weights within groups may take: 48 MB."""
 
 FEWEST_EPOCHS = 3.0
 """A hypothesis that fewer epochs carry than this can't be told from a few bad images."""
@@ -168,7 +169,6 @@ def _spread(values: np.ndarray, used: np.ndarray, shape: tuple[int, ...], fill) 
 def _group_arrays(scene: Scene, arrangement: Arrangement, family: Family):
     """Port numbers [groups, terms] and patterns [groups, terms, cells, rows] of a family."""
     ports = np.array([[PORT_INDEX[t.port] for t in g.terms] for g in family.groups])
-    drivers = jnp.asarray(arrangement.drivers)
     known: dict[tuple, np.ndarray] = {}
     shape = (len(family.groups), family.n_terms, *arrangement.rows.shape)
     patterns = np.zeros(shape)
@@ -176,7 +176,7 @@ def _group_arrays(scene: Scene, arrangement: Arrangement, family: Family):
         for k, term in enumerate(group.terms):
             key = (term.driver, term.basis, term.constants)
             if key not in known:
-                values = np.append(np.asarray(pattern(term, drivers)), 0.0)
+                values = np.append(np.asarray(pattern(term, arrangement.drivers)), 0.0)
                 known[key] = values[arrangement.rows]
             own = known[key]
             if group.mark is not None:

@@ -12,8 +12,9 @@ from jaxvm.discover.heldout import HeldOut, Split
 from jaxvm.discover.hypotheses import enumerate_hypotheses
 from jaxvm.discover.noise import LONGEST, memory, multipliers
 from jaxvm.discover.revise import prune, rename
+from jaxvm.discover.rivals import rivals
 from jaxvm.discover.score import Battery, Ranking, battery, score_residuals
-from jaxvm.discover.select import refit, rivals, shortlist, stacked
+from jaxvm.discover.select import refit, shortlist, stacked
 from jaxvm.solve.adjust import Adjustment
 from jaxvm.solve.covariance import effect_deviations
 from jaxvm.solve.snooping import robust_variance
@@ -142,14 +143,7 @@ class Search:
     def _finding(self, accepted: Accepted, leading) -> Finding:
         chosen, parts, current = accepted.chosen, self.parts, self.current
         weight, doubles = rivals(
-            current.scene,
-            self._arrangement,
-            self._asked,
-            accepted,
-            leading,
-            current,
-            parts.n,
-            self._signs,
+            current, self._arrangement, self._asked, accepted, leading, parts.n, self._signs
         )
         return Finding(
             hypothesis=chosen.hypothesis,

@@ -5,25 +5,18 @@ The evidence is on the scale of chi-square (twice the log of a posterior weight,
     E = drop / variance - columns ln n + 2 ln prior.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxvm.discover.cells import Arrangement
 from jaxvm.discover.heldout import Split
 from jaxvm.discover.hypotheses import Hypothesis
-from jaxvm.discover.score import Battery, Ranking, score_residuals, top
+from jaxvm.discover.score import Ranking, top
 from jaxvm.network.scene import Scene
 from jaxvm.physics.catalogue import Entry
 from jaxvm.physics.effects import Effect, room_for
 from jaxvm.physics.forms import FORMS
 from jaxvm.solve.adjust import Adjustment, adjust
-
-if TYPE_CHECKING:
-    from jaxvm.discover.accept import Accepted
 
 DECIDED = 2.0 * np.log(20.0)
 """Gap in chi-square at which one hypothesis is twenty times as likely as another."""
@@ -52,15 +45,6 @@ class Candidate:
     def effect(self) -> Effect:
         """The effect with its refitted values."""
         return self.adjustment.scene.fitted_effects()[-1]
-
-
-@dataclass(frozen=True)
-class Rival:
-    """A hypothesis that the recording can't tell from the chosen one."""
-
-    hypothesis: Hypothesis
-    gap: float
-    weight: float
 
 
 def log_prior(hypothesis: Hypothesis, amplitudes: np.ndarray) -> float:
@@ -198,81 +182,6 @@ def _sensible(scene: Scene, effect: Effect) -> bool:
         if constant.unit == "s" and value > 3.0 * span:
             return False
     return True
-
-
-def rivals(
-    scene: Scene,
-    arrangement: Arrangement,
-    battery: Battery,
-    accepted: Accepted,
-    leading,
-    before: Adjustment,
-    n: int,
-    signs: np.ndarray,
-) -> tuple[float, list[Rival]]:
-    """Hypotheses that the recording can't tell from the chosen one at 20:1.
-
-    With e the chosen effect as it stands in the residuals and lambda = |e|^2 its drop of
-    chi-square, a hypothesis that explains the share rho^2 of e is worse by lambda (1 - rho^2): what
-    the recording can be expected to show. What it did show counts, too: of refitted ones (`near`),
-    and of `leading` ones that were not worth a refit, as one tangent foretells it.
-    Other names for the chosen combination are always rivals.
-
-    Returns:
-        The posterior weight of the chosen one, and its rivals with theirs.
-    """
-    chosen, near = accepted.chosen, accepted.near
-    variance = chosen.adjustment.variance_factor
-    change = stacked(before) - stacked(chosen.adjustment)
-    full = float(np.sum(change**2)) / variance
-    still = np.zeros_like(signs)
-    alike = score_residuals(scene, arrangement, battery, variance, still, residual=change)
-    own_identity = identity(chosen.hypothesis)
-    penalty = len(chosen.effect.amplitudes) + len(chosen.effect.constants)
-    own_prior = log_prior(chosen.hypothesis, np.asarray(chosen.effect.amplitudes))
-    found: dict[tuple, Rival] = {}
-
-    def weigh(hypothesis: Hypothesis, amplitudes: np.ndarray, gap: float, fit: float) -> None:
-        for named in _one_by_one(hypothesis):
-            key = identity(named)
-            log_odds = fit + log_prior(named, np.asarray(amplitudes)) - own_prior
-            if key != own_identity and (key not in found or log_odds > found[key].weight):
-                found[key] = Rival(named, gap, float(log_odds))
-
-    for hypothesis, drop, amplitudes in top(alike, scene, 400):
-        gap = max(full - drop / variance, 0.0)
-        if gap <= DECIDED:
-            cost = len(amplitudes) + len(hypothesis.course.constants) - penalty
-            weigh(hypothesis, amplitudes, float(gap), -0.5 * (gap + cost * np.log(n)))
-    for other in near:
-        behind = chosen.evidence - other.evidence
-        if behind <= DECIDED and not any(
-            r.hypothesis.same(other.hypothesis) for r in found.values()
-        ):
-            amplitudes = np.asarray(other.effect.amplitudes)
-            gap = 2.0 * (other.adjustment.cost - chosen.adjustment.cost) / variance
-            prior = log_prior(other.hypothesis, amplitudes) - own_prior
-            weigh(other.hypothesis, amplitudes, max(float(gap), 0.0), -0.5 * behind - prior)
-    refitted = [candidate.hypothesis for candidate in accepted.tried]
-    foretold = [own for h, own, _ in leading if h.same(chosen.hypothesis)]
-    for hypothesis, own, amplitudes in leading if foretold else ():
-        behind = max(foretold[0] - own, 0.0)
-        named = bool(hypothesis.entries)
-        if named and behind <= DECIDED and not any(r.same(hypothesis) for r in refitted):
-            prior = log_prior(hypothesis, np.asarray(amplitudes)) - own_prior
-            weigh(hypothesis, amplitudes, behind, -0.5 * behind - prior)
-    weigh(chosen.hypothesis, np.asarray(chosen.effect.amplitudes), 0.0, 0.0)
-    odds = np.array([0.0, *(r.weight for r in found.values())])
-    weights = np.exp(odds - np.logaddexp.reduce(odds))
-    pairs = zip(found.values(), weights[1:], strict=True)
-    kept = [replace(r, weight=float(w)) for r, w in pairs if w >= 0.01]
-    return float(weights[0]), sorted(kept, key=lambda r: -r.weight)
-
-
-def _one_by_one(hypothesis: Hypothesis) -> list[Hypothesis]:
-    """A hypothesis under each of its names alone; itself where it has none."""
-    named = [replace(hypothesis, entries=(entry,)) for entry in hypothesis.entries]
-    return named or [hypothesis]
 
 
 def stacked(adjustment: Adjustment) -> np.ndarray:

@@ -101,9 +101,7 @@ def rows(
     values: Float[Array, "columns epochs"],
 ) -> Float[Array, "observations components"]:
     """Predicted minus measured of one table, in its unit."""
-    amplitude = flat[jnp.asarray(network.layout.all("amplitude"))]
-    acting = Acting(amplitude, network.effects.ports, values)
-    return _chained(_values, factor, flat, _ports(factor, acting.roomy()))
+    return _chained(_values, factor, flat, _ports(factor, _acting(network, flat, values)))
 
 
 def _chained(function, factor: Factor, flat, ports):
@@ -128,9 +126,12 @@ class Acting(NamedTuple):
     ports: Float[Array, "columns ports"]
     value: Float[Array, "columns epochs"]
 
-    def roomy(self) -> "Acting":
-        """With spare epochs, so that a recording of another length is no other program."""
-        return self._replace(value=roomy(self.value, axis=1))
+
+def _acting(network: Network, flat, values) -> Acting:
+    """With spare epochs, so that a recording of another length is no other program."""
+    (flat,) = hosted(flat)
+    amplitude = flat[network.layout.all("amplitude")]
+    return Acting(amplitude, network.effects.ports, roomy(values, axis=1))
 
 
 def parts_of(factor: Factor, flat: Float[Array, " n"]) -> tuple[Float[Array, "n part"], ...]:
@@ -184,8 +185,7 @@ def linearise(
     the tangent is computed when it is asked for, else it is empty.
     """
     layout, n_own = network.layout, factor.slots.shape[1]
-    amplitude = flat[jnp.asarray(layout.all("amplitude"))]
-    acting = Acting(amplitude, network.effects.ports, values).roomy()
+    acting = _acting(network, flat, values)
     ports = _ports(factor, acting)
     affected = ports is not None
     if tangent and not affected and isinstance(factor, PixelFactor | RangeFactor):

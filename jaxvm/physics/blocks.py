@@ -20,16 +20,15 @@ _SMALL = 64
 """Rows of a block of a small table."""
 
 
-def traced(*values) -> bool:
-    """Whether a transformation of JAX is under way on any of the arrays."""
-    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
+def whole(*values) -> bool:
+    """Whether tables are one program: under a transformation of JAX, and on an accelerator."""
+    leaves = jax.tree.leaves(values)
+    return jax.default_backend() != "cpu" or any(isinstance(leaf, Tracer) for leaf in leaves)
 
 
 def hosted(*arrays) -> Any:
-    """Arrays as NumPy's where no transformation is under way: indexing them compiles nothing."""
-    if traced(arrays) or jax.default_backend() != "cpu":
-        return arrays
-    return tuple(np.asarray(array) for array in arrays)
+    """Arrays as NumPy's unless tables are one program: indexing them compiles nothing."""
+    return arrays if whole(arrays) else tuple(np.asarray(array) for array in arrays)
 
 
 def by_blocks(function: Callable, table, *common, size: int | None = None) -> Any:
@@ -41,7 +40,7 @@ def by_blocks(function: Callable, table, *common, size: int | None = None) -> An
         common: what all rows share.
         size: rows of a block; by default `BLOCK`, less for a small table.
     """
-    if traced(table, common) or jax.default_backend() != "cpu":
+    if whole(table, common):
         return function(table, *common)
     leaves, structure = jax.tree.flatten(table)
     leaves = [np.asarray(leaf) for leaf in leaves]
@@ -61,7 +60,7 @@ def _cut(leaf: np.ndarray, start: int, size: int) -> np.ndarray:
     return leaf[np.minimum(np.arange(start, start + size), len(leaf) - 1)]
 
 
-def roomy(values, axis: int = 0, least: int = 64):
+def roomy(values, axis: int = 0, least: int = 64) -> Any:
     """An array filled up with its last value along an axis, to a power of two, `least` or more."""
     return _grown(values, axis, least, mode="edge")
 
@@ -79,7 +78,7 @@ def continued(series):
 def _grown(values, axis: int, least: int, **how):
     n = values.shape[axis]
     size = max(least, 1 << max(n - 1, 0).bit_length())
-    if traced(values) or n in (0, size):
+    if whole(values) or n in (0, size):
         return values
     widths = [(0, 0)] * np.ndim(values)
     widths[axis] = (0, size - n)

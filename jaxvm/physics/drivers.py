@@ -188,7 +188,7 @@ def range_drivers(
 
 
 def pattern(
-    term: Term, drivers: Float[Array, "observations drivers"]
+    term: Term, drivers: Float[Array | np.ndarray, "observations drivers"]
 ) -> Float[Array, " observations"]:
     """Pattern of one term over a table of observations; 0 where its driver has no meaning (NaN)."""
     constants = np.array((*term.constants, 1.0, 1.0)[:2], float)

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxvm.physics.blocks import by_blocks, continued, hosted, roomy, traced
+from jaxvm.physics.blocks import by_blocks, continued, hosted, roomy, whole
 from jaxvm.physics.forms import BASIS_INDEX, EVERY_KIND, FORMS, Form, evaluate_basis, kinds_of
 from jaxvm.physics.ports import N_PORTS, PORT_INDEX
 
@@ -258,7 +258,7 @@ def evaluate(rows, channels: Channels) -> Float[Array, "n epochs"]:
 def _by_kinds(function, rows, channels: Channels) -> Any:
     """A function of courses at the epochs, evaluated for those of one kind of basis at once."""
     n, grid = len(channels.epoch_time), (channels.time, channels.epoch_time)
-    if traced(rows, grid) or not len(rows[0]):
+    if whole(rows, grid) or not len(rows[0]):
         return function(rows, *grid)
     # Spare times: a recording of another length is no other program.
     grid = continued(channels.time), roomy(channels.epoch_time)

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from jaxvm.discover.diagnosis import Diagnosis, Finding
-from jaxvm.discover.select import Rival
+from jaxvm.discover.rivals import Rival
 from jaxvm.discover.shape import shape_words
 from jaxvm.physics.catalogue import BY_ID
 from jaxvm.report.words import Parameter, explanation, parameters, separate_by, when

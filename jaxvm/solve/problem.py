@@ -155,8 +155,12 @@ class Problem(eqx.Module):
 
     def normal(self, x: Float[Array, " n"]) -> Normal:
         """Cost, gradient and Gauss-Newton matrix, with the weights of the robust loss."""
+        return self.assembled(self.linearised(x))
+
+    def assembled(self, tables: list[Linearised]) -> Normal:
+        """The same of tables that are linearised already."""
         own = [factor.slots.shape[1] for factor in self.network.factors()]
-        return _assembled(self.linearised(x), self.packets, own, self.loss, self.sizes)
+        return _assembled(tables, self.packets, own, self.loss, self.sizes)
 
 
 @jax.jit

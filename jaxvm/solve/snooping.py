@@ -38,9 +38,10 @@ def redundancy(adjustment: Adjustment) -> tuple[np.ndarray, ...]:
 
 
 def _redundancies(problem: Problem, x):
-    jacobians = [table.jacobian for table in problem.linearised(x)]
+    tables = problem.linearised(x)
+    jacobians = [table.jacobian for table in tables]
     counted = [factor.weight > 0.0 for factor in problem.network.factors()]
-    hessian = problem.normal(x).hessian
+    hessian = problem.assembled(tables).hessian
     return _complements(hessian, problem.packets, jacobians, counted, problem.sizes)
 
 
