@@ -1,7 +1,7 @@
 """The catalogue: every entry is well formed, can be found, and gives the name that it should."""
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -10,15 +10,19 @@ import pytest
 from networks import matrix, stereo_recording, to_plane, to_point
 
 from jaxvm.discover.hypotheses import Hypothesis, driver_kind, enumerate_hypotheses, member
-from jaxvm.network.binding import range_driver_table
+from jaxvm.network.binding import in_scope, range_driver_table
 from jaxvm.network.residual import residual
 from jaxvm.network.scene import Scene, build
+from jaxvm.network.tables import along_beam
 from jaxvm.physics.catalogue import BY_ID, CATALOGUE, entries_for
+from jaxvm.physics.catalogue.entry import each_mark
 from jaxvm.physics.catalogue.range import UNITS_M
 from jaxvm.physics.drivers import (
     CHANNEL_UNITS,
     OBSERVATION_DRIVER_INDEX,
     OBSERVATION_DRIVERS,
+    PLANES,
+    build_channels,
     channel_kind,
     pattern,
 )
@@ -61,8 +65,8 @@ def test_entry_is_well_formed(entry):
     assert 0.0 < entry.plausible[0] < entry.plausible[1]
     assert entry.rows and all(1 <= row <= 98 for row in entry.rows)
     assert list(entry.rows) == sorted(set(entry.rows))
-    assert entry.entity in ("camera", "station", "target", "mark", "rangefinder")
-    assert set(entry.drivers) <= {"constant", "time", "power-on", "quantity"} | KINDS
+    assert entry.entity in ("camera", "station", "target", "face", "mark", "rangefinder")
+    assert set(entry.drivers) <= {"constant", "time", "power-on", "quantity", "neighbour"} | KINDS
     assert set(entry.forms) <= set(FORMS)
     assert ("constant" in entry.drivers) == ("constant" in entry.forms)
     assert len(set(entry.groups)) == len(entry.groups)
@@ -70,7 +74,11 @@ def test_entry_is_well_formed(entry):
     assert units <= {"m", "rad"} or len(units) == 1 or entry.id == "radial-beyond-model"
     for term in (term for group in entry.groups for term in group):
         assert term.port in PORT_INDEX
-        assert term.driver in OBSERVATION_DRIVERS and term.basis in BASES
+        assert (
+            term.driver in OBSERVATION_DRIVERS
+            and term.basis in BASES
+            or (term.driver in PLANES and term.basis == "tile")
+        )
         assert (term.driver == "one") == (term.basis == "one")
 
 
@@ -81,7 +89,7 @@ def test_no_two_entries_claim_the_same():
         for group in entry.groups:
             for driver in entry.drivers:
                 for form in entry.forms:
-                    first = claimed.setdefault((group, driver, form), entry.id)
+                    first = claimed.setdefault((group, entry.entity, driver, form), entry.id)
                     pair = {first, entry.id}
                     assert first == entry.id or pair in ALIKE, (pair, group, driver, form)
 
@@ -102,6 +110,12 @@ ALIKE = (
     {"window-lens-power", "focal-sun"},
     # Both are a delay from one moment on.
     {"frame-slip", "trigger-late"},
+    # A wedge turns all rays as a turn of the camera does.
+    {"mount-slip", "window-refitted"},
+    # Sunlight heats the housing and brightens one side of the marks.
+    {"principal-point-sun", "light-bias"},
+    # A longer exposure heats the sensor and lets bright marks bloom.
+    {"duty-cycle", "blooming"},
 )
 
 
@@ -113,31 +127,36 @@ def test_kind_of_a_channel(name, kind):
     assert channel_kind(name) == kind
 
 
-def names(terms, *args):
-    return [entry.id for entry in entries_for(terms, *args)]
+def names(terms, entity, form, *kinds):
+    return [entry.id for entry in entries_for(terms, entity, kinds, form)]
 
 
 def test_the_kind_of_a_channel_decides_the_name():
     focal, turn = (Term("sensor.focal"),), (Term("mount.turn_x"),)
-    assert names(focal, "quantity", "linear", "temperature") == [
-        "focal-drift",
-        "device-compensates",
-    ]
-    assert names(focal, "quantity", "linear", "pressure") == ["focal-pressure"]
-    assert names(focal, "quantity", "linear", "irradiance") == ["window-lens-power", "focal-sun"]
+    of_camera = partial(names, focal, "camera", "linear", "quantity")
+    assert of_camera("temperature") == ["focal-drift", "device-compensates"]
+    assert of_camera("pressure") == ["focal-pressure"]
+    assert of_camera("irradiance") == ["window-lens-power", "focal-sun"]
     # A load does not heat a lens, but it bends a mount.
-    assert (
-        names(focal, "quantity", "linear", "quantity") == names(focal, "quantity", "linear") == []
-    )
-    assert names(turn, "quantity", "linear", "quantity") == ["mount-loaded"]
+    assert of_camera("quantity") == of_camera() == []
+    of_mount = partial(names, turn, "camera", "linear", "quantity")
+    assert of_mount("quantity") == ["mount-loaded"]
     # Where the kind is named, what takes any quantity is not meant.
-    assert names(turn, "quantity", "linear", "temperature") == ["mount-turn"]
+    assert of_mount("temperature") == ["mount-turn"]
+    # The temperature of another camera may be that of its surroundings, or its own heat.
+    assert of_mount("temperature", "neighbour") == ["mount-turn", "mount-loaded"]
     scale = (Term("range.scale"),)
-    assert names(scale, "quantity", "linear", "pressure") == ["range-air"]
-    assert names(scale, "constant", "constant") == ["range-scale"]
+    assert names(scale, "rangefinder", "linear", "quantity", "pressure") == ["range-air"]
+    assert names(scale, "rangefinder", "constant", "constant") == ["range-scale"]
     # Time is no quantity.
-    assert names(turn, "time", "linear") == ["mount-creep"]
-    assert names(turn, "power-on", "onset") == ["mount-warm-up"]
+    assert names(turn, "camera", "linear", "time") == ["mount-creep"]
+    assert names(turn, "camera", "onset", "power-on") == ["mount-warm-up"]
+    # The same terms of another body are another effect.
+    image = (Term("sensor.cx"), Term("sensor.cy"))
+    assert names(image, "target", "linear", "quantity", "light") == ["side-light"]
+    # What each mark has for itself is named whatever their number.
+    marks = each_mark("target.point_z", marks=range(7, 20))
+    assert names(marks, "target", "constant", "constant") == ["marks-of-other-depth"]
 
 
 # --- every entry can be found ---------------------------------------------------------------------
@@ -161,16 +180,29 @@ def logged_scene() -> Scene:
 
 
 @cache
+def parted_scene() -> Scene:
+    """The same with each camera on a station of its own: targets have two faces."""
+    recording = logged_scene().recording
+    (bar,), (left, right) = recording.model.stations, recording.model.cameras
+    model = replace(
+        recording.model,
+        stations=(bar, replace(bar, name="other")),
+        cameras=(left, replace(right, station="other")),
+    )
+    return build(replace(recording, model=model))
+
+
+@cache
 def first_names() -> dict[str, Hypothesis]:
     """For each entry that some hypothesis may be called by: one such hypothesis."""
-    scene, found = logged_scene(), {}
-    for family in enumerate_hypotheses(scene):
-        pairs = np.argwhere(family.valid.any(axis=2))
-        for g, c in pairs:
-            s = int(np.argmax(family.valid[g, c]))
-            hypothesis = member(family, (g, c, s), scene)
-            for entry in hypothesis.entries:
-                found.setdefault(entry.id, replace(hypothesis, entries=(entry,)))
+    found: dict[str, Hypothesis] = {}
+    for scene in (logged_scene(), parted_scene()):
+        for family in enumerate_hypotheses(scene):
+            for g, c in np.argwhere(family.valid.any(axis=2)):
+                s = int(np.argmax(family.valid[g, c]))
+                hypothesis = member(family, (g, c, s), scene)
+                for entry in hypothesis.entries:
+                    found.setdefault(entry.id, replace(hypothesis, entries=(entry,)))
     return found
 
 
@@ -179,16 +211,20 @@ def test_entry_names_a_hypothesis(entry):
     hypothesis = first_names()[entry.id]
     assert hypothesis.effect(()).name == entry.physics
     assert hypothesis.group.entity == entry.entity
-    scope = hypothesis.scope.as_dict()
-    assert set(scope) == ({"target", "point"} if entry.entity == "mark" else {entry.entity})
+    kinds = {"mark": {"target", "point"}, "face": {"camera", "target"}}
+    assert set(hypothesis.scope.as_dict()) == kinds.get(entry.entity, {entry.entity})
 
 
 def test_time_is_asked_of_marks_but_not_too_often():
     scene = logged_scene()
     marks = [f for f in enumerate_hypotheses(scene) if f.groups[0].mark is not None]
-    assert {c.form for f in marks for c in f.courses} == {"constant", "step", "onset", "creep"}
+    forms = {"constant", "linear", "step", "onset", "creep", "settling"}
+    assert {c.form for f in marks for c in f.courses} == forms
     assert all(
-        driver_kind(scene, c.driver) in ("constant", "time") for f in marks for c in f.courses
+        driver_kind(scene, c.driver) in ("constant", "time")
+        or channel_kind(c.driver) == "temperature"
+        for f in marks
+        for c in f.courses
     )
     assert sum(int(f.valid.sum()) for f in marks) < 4000
     hypothesis = member(marks[0], (3, 0, 0), scene)
@@ -276,11 +312,54 @@ def test_cyclic_error_is_one_entry_with_many_units():
     assert all([t.basis for t in group] == ["sine", "cosine"] for group in entry.groups)
 
 
-def test_a_step_over_the_image_parts_it_in_the_middle():
+def test_a_seam_parts_the_image():
     table = np.zeros((4, len(OBSERVATION_DRIVERS)))
-    table[:, OBSERVATION_DRIVER_INDEX["column"]] = [-0.5, -1e-9, 1e-9, 0.5]
-    (term,) = BY_ID["sensor-stitched"].groups[0]
-    assert jax.jit(lambda t: pattern(term, t))(table).tolist() == [0.0, 0.0, 1.0, 1.0]
+    at = np.array([-0.5, -1e-9, 1e-9, 0.5])
+    for place, name in ((0.0, "row"), (0.0, "column"), (0.24, "column")):
+        term = Term("detect.u", name, "step", (place,))
+        assert any(term in group for group in BY_ID["sensor-stitched"].groups)
+        table[:, OBSERVATION_DRIVER_INDEX[name]] = place + at
+        assert jax.jit(lambda t, term=term: pattern(term, t))(table).tolist() == [0, 0, 1, 1]
+
+
+def test_each_mark_has_its_own_column():
+    table = np.zeros((3, len(OBSERVATION_DRIVERS)))
+    table[:, OBSERVATION_DRIVER_INDEX["mark"]] = [4.0, 5.0, 6.0]
+    terms = each_mark("target.point_z", marks=range(4, 7))
+    columns = [np.asarray(pattern(term, table)) * term.weight for term in terms]
+    np.testing.assert_allclose(columns, np.eye(3), atol=1e-15)
+
+
+def test_a_face_is_a_target_as_one_camera_sees_it():
+    scene = parted_scene()
+    scope = first_names()["hand-over-plate"].scope
+    rows = scene.tables[0]
+    obs = scene.recording.observations
+    names = [c.name for c in scene.model.cameras], [t.name for t in scene.model.targets]
+    own = (obs.camera[rows] == names[0].index(*scope.camera)) & (
+        obs.target[rows] == names[1].index(*scope.target)
+    )
+    assert own.any() and np.array_equal(in_scope(scene, scope, rows), own)
+
+
+def test_cameras_stand_along_their_beam():
+    station = np.array([0, 0, 1, 0, 2, 2])
+    place = np.zeros((6, 3))
+    place[:, 1] = [0.2, 0.6, 5.0, 0.3, 1.0, 1.0]
+    places = along_beam(station, place)
+    expected = [-1.0, 1.0, np.nan, -0.5, np.nan, np.nan]  # alone; two in one place
+    assert np.allclose(places, expected, equal_nan=True) or np.allclose(
+        places, -np.array(expected), equal_nan=True
+    )
+
+
+def test_bodies_are_compared_with_the_air():
+    recorded = {"ambient_degC": np.array([1.0, 2.0]), "body_left_degC": np.array([4.0, 7.0])}
+    channels = build_channels(np.array([0.0, 1.0]), recorded, None, {})
+    name = "body_left_degC - ambient_degC"
+    assert channels.kinds[channels.index(name)] == "difference"
+    assert np.asarray(channels.values[channels.index(name)]).tolist() == [3.0, 5.0]
+    assert channel_kind(name) == "temperature"
 
 
 # --- materials ------------------------------------------------------------------------------------

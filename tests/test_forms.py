@@ -185,6 +185,17 @@ def spline_about(centre, spacing, x):
 
 X = np.array([-3.0, -0.5, 0.0, 0.7, 2.0, 4.0])
 T = np.array([0.0, 600.0, 1800.0, 2400.0, 3600.0, 7200.0])
+
+
+def lagged_by_hand(x, t, tau):
+    """tau y' + y = x with x straight between its samples: x - m tau, and a rest that dies away."""
+    y = [x[0]]
+    for dt, start, slope in zip(np.diff(t), x, np.diff(x) / np.diff(t), strict=False):
+        rest = (y[-1] - start + slope * tau) * np.exp(-dt / tau)
+        y.append(start + slope * dt - slope * tau + rest)
+    return np.array(y)
+
+
 EXPECTED = {  # with the constants 2 and 0.5, written without the package
     "one": np.ones(6),
     "late onset": np.where(X > 2.0, 1.0 - np.exp(-(X - 2.0) / 0.5), 0.0),
@@ -199,7 +210,11 @@ EXPECTED = {  # with the constants 2 and 0.5, written without the package
     "ramp": np.array([0, 0, 0, 0, 0, 2.0]),
     "sine": np.sin(np.pi * X),
     "cosine": np.cos(np.pi * X),
-    "direction": np.tanh(np.gradient(X, T / 3600.0) / 2.0),
+    "direction": np.tanh(np.gradient(lagged_by_hand(X, T, 0.5), T / 3600.0) / 2.0),
+    "aged": X * np.array([0, 1 / 6, 1 / 2, 2 / 3, 1, 2]),  # hours
+    "decay": np.exp(-np.maximum(X, 0.0) / 2),
+    "slow decay": np.exp(-np.maximum(X, 0.0) / 0.5),
+    "staircase": np.array([-3, -1, 1, 1, 1, 5]),  # steps of 2, half a step off zero
     "rate": np.gradient(X, T / 3600.0),
     "play": np.array([-3, -2.5, -2, -1.3, 0, 2]) - X,
     "bump": np.array([0, 0, 0, 0, 2 / 3, 0]),  # about 2, knots 0.5 apart

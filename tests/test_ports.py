@@ -37,6 +37,8 @@ GENERAL = Circumstances(
     target_centre=np.array([0.55, 0.35, 0.0]),
     target_half_size=np.array([0.6, 0.4]),
     checker=np.array(1.0),
+    mark=np.array(3.0),
+    along_beam=np.array(-1.0),
     velocity=np.array([0.7, -0.4, 0.5, 0.3, -0.2, 0.4]),
 )
 POINT = np.array([0.83, 0.21, 0.0])
@@ -593,7 +595,9 @@ def _bench_arrays(bench):
         world_from_target=(*bench.target_turn, *bench.origin),
         point=bench.point,
     )
-    at = Circumstances((CX, bench.row), ROWS, bench.centre, bench.half_size, 1.0, bench.velocity)
+    at = Circumstances(
+        (CX, bench.row), ROWS, bench.centre, bench.half_size, 1.0, 0.0, 0.0, bench.velocity
+    )
     return (
         Sight(*(np.asarray(x, float) for x in sight)),
         Circumstances(*(np.asarray(x, float) for x in at)),

@@ -15,7 +15,7 @@ DRIFT = Hypothesis(
     Group(FOCAL, "camera"),
     Course("body_degC", "linear"),
     Scope(camera=("left",)),
-    entries_for(FOCAL, "quantity", "linear", "temperature"),
+    entries_for(FOCAL, "camera", ("quantity", "temperature"), "linear"),
 )
 
 

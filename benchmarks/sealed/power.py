@@ -225,21 +225,20 @@ def best_by_name(
     """
     drops: dict[str, float] = {}
     evidence: dict[str, float] = {}
-    known: dict[tuple, tuple[str, ...]] = {}
     for scores in ranking.scores:
-        family = scores.family
-        over_scopes = np.where(scores.valid, scores.drop, 0.0).max(axis=2) / variance
-        for g, group in enumerate(family.groups):
-            for c, course in enumerate(family.courses):
-                key = (group, course.driver, course.form)
-                if key not in known:
-                    entries = member(family, (g, c, 0), scene).entries
-                    known[key] = tuple(entry.id for entry in entries) or ("",)
-                drop = float(over_scopes[g, c])
-                unknowns = family.n_terms * family.n_bases + len(course.constants)
-                for name in known[key]:
-                    drops[name] = max(drops.get(name, 0.0), drop)
-                    evidence[name] = max(evidence.get(name, -np.inf), drop - unknowns * price)
+        family, largest = scores.family, {}
+        for g, c, s in np.argwhere(scores.valid):
+            course = family.courses[c]
+            key = (g, s, course.driver, course.form)
+            drop = float(scores.drop[g, c, s]) / variance
+            if drop > largest.get(key, ((), -np.inf))[1]:
+                largest[key] = ((g, c, s), drop)
+        for index, drop in largest.values():
+            entries = member(family, index, scene).entries
+            unknowns = family.n_terms * family.n_bases + len(family.courses[index[1]].constants)
+            for name in [entry.id for entry in entries] or [""]:
+                drops[name] = max(drops.get(name, 0.0), drop)
+                evidence[name] = max(evidence.get(name, -np.inf), drop - unknowns * price)
     return drops, evidence
 
 

@@ -7,8 +7,6 @@ detector errs, or a plate stands off its plane, by a smooth surface over the ima
 import numpy as np
 
 from jaxvm.network.scene import Scene
-from jaxvm.physics.drivers import PLANES
-from jaxvm.physics.effects import Term
 from jaxvm.physics.forms import N_KNOTS
 
 CURVED = (
@@ -66,27 +64,3 @@ def curved_drivers(scene: Scene, form: str = "curve") -> list[tuple[str, tuple[f
             constants = curve_constants(float(values.min()), float(values.max()), form)
             found.append((name, constants))
     return found
-
-
-def image_map() -> tuple[Term, ...]:
-    """A smooth map of errors of the detector, along u and along v."""
-    return _tiles("detect.u", "image", 5, 4) + _tiles("detect.v", "image", 5, 4)
-
-
-def fine_image_map() -> tuple[Term, ...]:
-    """The same with finer tiles, for dents and fringes."""
-    return _tiles("detect.u", "fine image", 9, 7) + _tiles("detect.v", "fine image", 9, 7)
-
-
-def plate_map() -> tuple[Term, ...]:
-    """A smooth surface by which a plate stands off its plane."""
-    return _tiles("target.point_z", "plate", 5, 5)
-
-
-def _tiles(port: str, plane: str, columns: int, rows: int) -> tuple[Term, ...]:
-    width = PLANES[plane][2]
-    return tuple(
-        Term(port, plane, "tile", (width * (i - (columns - 1) / 2), width * (j - (rows - 1) / 2)))
-        for j in range(rows)
-        for i in range(columns)
-    )

@@ -25,6 +25,7 @@ class Finding:
         stds: standard deviations of the amplitudes, then of the constants.
         final_effect, final_stds: the same from all epochs, together with all later findings.
         weight: posterior weight among its doubles.
+        drivers: others that it may follow as well.
         rivals: hypotheses that this recording can't tell from it.
         p_value: family-wise, under noise that remembers as long as the residuals do.
         p_independent: the same for noise that is independent from epoch to epoch.
@@ -48,6 +49,7 @@ class Finding:
     final_effect: Effect
     final_stds: tuple[float, ...]
     weight: float
+    drivers: tuple[str, ...]
     rivals: tuple[Rival, ...]
     p_value: float
     p_independent: float

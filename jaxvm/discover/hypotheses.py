@@ -7,7 +7,7 @@ the shapes of their products when they are scored.
 
 import math
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -15,13 +15,11 @@ from jaxvm.discover.curves import (
     CURVED,
     CURVED_FAST,
     curved_drivers,
-    fine_image_map,
-    image_map,
-    plate_map,
 )
 from jaxvm.network.scene import Scene
 from jaxvm.physics.catalogue import CATALOGUE, Entry, entries_for
-from jaxvm.physics.catalogue.lens import FINE_RINGS, RINGS
+from jaxvm.physics.catalogue.entry import each_mark
+from jaxvm.physics.catalogue.maps import fine_image_map, image_map, plate_map
 from jaxvm.physics.drivers import channel_kind
 from jaxvm.physics.effects import Effect, Scope, Term
 from jaxvm.physics.forms import FORMS
@@ -60,6 +58,9 @@ _TWICE = {("target.point_z", "target_x", "square"), ("target.point_z", "target_y
 
 _PATTERNED_PORTS = ("detect.u", "detect.v", "sensor.focal", "target.point_z")
 
+NAMED_ONLY = ("ageing", "staircase", "two decays", "direction")
+"""Forms that are asked only where the catalogue names them."""
+
 _MOST_OF_MARKS = 3000
 """Hypotheses about single marks; where marks and instants are many, fewer instants are asked."""
 
@@ -72,6 +73,8 @@ class Group:
     entity: str
     mark: tuple[int, int] | None = None
     """(target, point) when a single mark is meant."""
+    target: str = ""
+    """The only target that can have it, where the terms name its marks."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +93,8 @@ class Family:
 
     Hypothesis (g, c, s) is valid where the scope is of the group's kind; `valid` has the shape
     [groups, courses, scopes]. `kinds` are those of the courses' drivers, `asked` the number of
-    drivers and forms of that kind that the family asks about.
+    drivers and forms of that kind that the family asks about, `named` that in which each entry of
+    the catalogue is asked.
     """
 
     groups: tuple[Group, ...]
@@ -99,6 +103,7 @@ class Family:
     valid: np.ndarray
     kinds: tuple[str, ...]
     asked: tuple[int, ...]
+    named: dict[str, int]
 
     @property
     def n_terms(self) -> int:
@@ -115,15 +120,16 @@ class Family:
 class Hypothesis:
     """One member of a family.
 
-    `alternatives` is the number of others of its kind that were asked along (drivers and forms of
-    the same kind, marks): its own prior is the smaller, the more there were.
+    `alternatives` is the number of drivers and forms that were asked along under each name (and of
+    the same kind, under "" for none), marks counted, too: its own prior is the smaller, the more
+    there were.
     """
 
     group: Group
     course: Course
     scope: Scope
     entries: tuple[Entry, ...]
-    alternatives: int = 1
+    alternatives: dict[str, int] = field(default_factory=dict, compare=False)
 
     def same(self, other: "Hypothesis") -> bool:
         """Whether both say the same of the observations, whatever their names."""
@@ -175,7 +181,9 @@ def describe(hypothesis: Hypothesis) -> str:
     meaning = {port.name: port.meaning for port in PORTS}
     first = hypothesis.group.terms[0]
     words = _MAPS.get(first.driver, meaning[first.port])
-    if first.driver != "one" and first.driver not in _MAPS:
+    if first.driver == "mark":
+        words += ", for each mark by its own amount"
+    elif first.driver != "one" and first.driver not in _MAPS:
         words += f", varying with {first.driver.replace('_', ' ')}"
     if hypothesis.course.form != "constant":
         form = FORMS[hypothesis.course.form].words.format(driver=hypothesis.course.driver)
@@ -204,30 +212,30 @@ def enumerate_hypotheses(scene: Scene) -> tuple[Family, ...]:
         for entry in CATALOGUE
         if entry.entity != "mark"
         for terms in entry.groups
+        if terms[0].driver != "mark"
     ]
-    # Several ports at once follow every course; named patterns over observations do not change.
+    # Named groups without a pattern follow every course; the others only those that have a name.
     listed = {*single, *patterned}
-    named = [group for group in dict.fromkeys(named) if group not in listed]
-    fixed = [group for group in named if _is_patterned(group)]
-    moving = [group for group in named if group not in fixed]
-    by_bases = {n: [c for c in courses if len(FORMS[c.form].bases) == n] for n in (1, 2)}
+    every_named = list(dict.fromkeys(named))
+    moving = [g for g in every_named if g not in listed and not _is_patterned(g)]
+    common = [course for course in courses if course.form not in NAMED_ONLY]
+    by_bases = {n: [c for c in common if len(FORMS[c.form].bases) == n] for n in (1, 2)}
     constant = [Course("constant", "constant")]
     marks = _marks(scene)
     candidates = [
         (single, by_bases[1]),
         (single, by_bases[2]),
-        (patterned + _of_size(fixed, 1), constant),
-        (_of_size(fixed, 2), constant),
-        (_of_size(fixed, 3), constant),
-        (_of_size(moving, 2), by_bases[1]),
-        (_of_size(moving, 2), by_bases[2]),
-        (_of_size(moving, 3), by_bases[1]),
+        (patterned, constant),
+        *((_of_size(moving, size), by_bases[n]) for size in (1, 2, 3) for n in (1, 2)),
+        *_as_named(scene, every_named, courses, listed),
         (marks, _courses_of_marks(courses, len(marks))),
-        ([Group(RINGS, "camera")], constant),
-        ([Group(FINE_RINGS, "camera")], constant),
         *_free_forms(scene, constant),
+        *_of_each_mark(scene, constant),
     ]
-    families = (_family(scene, groups, own, scopes) for groups, own in candidates if groups and own)
+    asked = _asked_of_names(scene, courses)
+    families = (
+        _family(scene, groups, own, scopes, asked) for groups, own in candidates if groups and own
+    )
     return tuple(family for family in families if family.valid.any())
 
 
@@ -241,21 +249,48 @@ def member(family: Family, index: tuple[int, int, int], scene: Scene) -> Hypothe
     if group.mark is not None:
         target = scene.model.targets[group.mark[0]]
         scope = Scope(target=(target.name,), point=(target.point_names[group.mark[1]],))
-    kind, asked = family.kinds[index[1]], family.asked[index[1]]
-    entries = entries_for(group.terms, kind, course.form, channel_kind(course.driver))
-    if group.mark is not None:
-        asked *= len(family.groups)
+    kinds = _driver_kinds(family.kinds[index[1]], course.driver, scope)
+    entries = entries_for(group.terms, group.entity, kinds, course.form)
+    each = len(family.groups) if group.mark is not None else 1
+    asked = {entry.id: each * family.named[entry.id] for entry in entries}
+    asked[""] = each * family.asked[index[1]]
     return Hypothesis(group, course, scope, entries, asked)
 
 
+def _driver_kinds(kind: str, driver: str, scope: Scope) -> tuple[str, ...]:
+    """Kinds of a driver for the bodies of a scope, general ones first."""
+    if kind not in ("quantity", "difference"):
+        return (kind,)
+    own = channel_kind(driver)
+    body = driver.split(" - ")[0].removeprefix("body_").removesuffix("_degC")
+    if driver.startswith("body_") and len(scope.camera) == 1 and body not in scope.camera:
+        return ("quantity", own, "neighbour")
+    return ("quantity", own)
+
+
 def driver_kind(scene: Scene, driver: str) -> str:
-    """Kind of a time-like driver: "constant", "quantity", "time" or "power-on"."""
+    """Kind of a time-like driver: "constant", "quantity", "difference", "time" or "power-on"."""
     channels = scene.network.channels
     kind = channels.kinds[channels.index(driver)]
     return "time" if kind == "order" else kind
 
 
-def _family(scene: Scene, groups, courses, scopes) -> Family:
+def _asked_of_names(scene: Scene, courses: list[Course]) -> dict[str, int]:
+    """Number of drivers and forms in which each entry of the catalogue is asked."""
+    distinct = {(course.driver, course.form) for course in courses}
+    kinds = {d: _driver_kinds(driver_kind(scene, d), d, Scope()) for d, _ in distinct}
+    return {
+        entry.id: max(
+            sum(
+                f in entry.forms and any(k in entry.drivers for k in kinds[d]) for d, f in distinct
+            ),
+            1,
+        )
+        for entry in CATALOGUE
+    }
+
+
+def _family(scene: Scene, groups, courses, scopes, named: dict[str, int]) -> Family:
     kinds = [_kind(scope) for scope in scopes]
     driven = [driver_kind(scene, course.driver) for course in courses]
     distinct = set(zip(driven, ((c.driver, c.form) for c in courses), strict=True))
@@ -268,6 +303,7 @@ def _family(scene: Scene, groups, courses, scopes) -> Family:
                     valid[g, c, s] = s == 0
                     continue
                 valid[g, c, s] = kinds[s] == group.entity
+                valid[g, c, s] &= not group.target or scope.target == (group.target,)
                 if course.driver.startswith("time since power-on of "):
                     camera = course.driver.removeprefix("time since power-on of ")
                     valid[g, c, s] &= scope.camera == (camera,)
@@ -281,11 +317,43 @@ def _family(scene: Scene, groups, courses, scopes) -> Family:
         valid[seen],
         tuple(driven),
         tuple(asked[kind] for kind in driven),
+        named,
     )
 
 
+def _as_named(scene: Scene, groups: list[Group], courses: list[Course], listed: set[Group]):
+    """Groups and courses that are asked only where the catalogue has a name for both together.
+
+    Those that are `listed` are asked with the constant course already.
+    """
+    kinds = {
+        course.driver: _driver_kinds(driver_kind(scene, course.driver), course.driver, Scope())
+        for course in courses
+    }
+    together: dict[tuple, list[Group]] = {}
+    singles = [Group((Term(port.name),), _entity(port.name)) for port in PORTS]
+    for group in [*groups, *singles]:
+        entries = [e for e in CATALOGUE if group.terms in e.groups and e.entity == group.entity]
+        patterned = _is_patterned(group)
+        own = tuple(
+            place
+            for place, course in enumerate(courses)
+            if (course.form in NAMED_ONLY or (patterned and (place or group not in listed)))
+            and any(
+                course.form in e.forms and any(kind in e.drivers for kind in kinds[course.driver])
+                for e in entries
+            )
+        )
+        for n in (1, 2):
+            of_size = tuple(k for k in own if len(FORMS[courses[k].form].bases) == n)
+            if of_size:
+                together.setdefault((len(group.terms), of_size), []).append(group)
+    for (_, places), members in together.items():
+        yield members, [courses[k] for k in places]
+
+
 def _is_patterned(group: Group) -> bool:
-    return any(term.driver != "one" for term in group.terms)
+    return any(term.driver not in ("one", "along_beam") for term in group.terms)
 
 
 def _of_size(groups: list[Group], n_terms: int) -> list[Group]:
@@ -298,6 +366,8 @@ def _entity(port: str) -> str:
 
 
 def _kind(scope: Scope) -> str:
+    if scope.camera and scope.target:
+        return "face"
     return next(iter(scope.as_dict()), "all")
 
 
@@ -314,7 +384,19 @@ def _scopes(scene: Scene) -> list[Scope]:
         scopes += [Scope(**{kind: (name,)}) for name in names]
         if len(names) > 1:
             scopes.append(Scope(**{kind: names}))
-    return scopes
+    return scopes + _faces(scene)
+
+
+def _faces(scene: Scene) -> list[Scope]:
+    """Targets as single cameras see them, where cameras of several stations see them."""
+    model, obs = scene.model, scene.recording.observations
+    seen = np.unique(np.stack([obs.target, obs.camera], axis=1), axis=0)
+    found = []
+    for t, target in enumerate(model.targets):
+        seers = [model.cameras[c] for c in seen[seen[:, 0] == t, 1]]
+        if len({camera.station for camera in seers}) > 1:
+            found += [Scope(camera=(camera.name,), target=(target.name,)) for camera in seers]
+    return found
 
 
 def _courses(scene: Scene) -> list[Course]:
@@ -342,20 +424,38 @@ def _courses(scene: Scene) -> list[Course]:
                 Course(name, "proportional"),
                 Course(name, "rate"),
                 *(Course(name, "transient", (float(tau),)) for tau in lags[:4]),
-                Course(name, "direction", (float(np.median(rates)) + 1e-12,)),
+                *(
+                    Course(name, "direction", (float(share * np.median(rates)) + 1e-12, float(tau)))
+                    for share in (0.1, 0.7)
+                    for tau in (0.4 * lags[0], lags[0], lags[2])
+                ),
+                Course(name, "ageing", (), reference),
+                *(
+                    Course(name, "staircase", (float(share * width), phase), reference)
+                    for share in (0.12, 0.17, 0.22, 0.28, 0.36, 0.45)
+                    for phase in (0.0, 0.5)
+                ),
                 *(
                     Course(name, "hysteresis", (float(share * width),), reference)
                     for share in (0.1, 0.2, 0.3)
                 ),
             ]
+        elif kind == "difference":
+            courses.append(Course(name, "linear", (), reference))
+            courses += [Course(name, "lag", (float(tau),), reference) for tau in lags[1::2]]
         elif kind in ("time", "power-on"):
             since = time - time[0] if kind == "time" else np.interp(
                 time, channels.time, channels.values[channels.index(name)]
             )  # fmt: skip
             courses += [Course(name, "onset", (float(tau),)) for tau in lags]
             courses += [Course(name, "creep", (float(tau),)) for tau in lags[::2]]
+            if kind == "power-on":
+                courses += [
+                    Course(name, "two decays", (float(lags[k]), float(lags[k + 2])))
+                    for k in (0, 1, 2, 3)
+                ]
             if kind == "time":
-                courses.append(Course(name, "linear", (), reference))
+                courses += [Course(name, "linear", (), reference), Course(name, "proportional")]
                 courses += _courses_of_time(name, since, span, spacing)
                 courses += [
                     Course(name, "settling", (float(start), float(tau)))
@@ -395,6 +495,22 @@ def _free_forms(scene: Scene, constant: list[Course]):
     yield [Group(plate_map(), "target")], constant
 
 
+def _of_each_mark(scene: Scene, constant: list[Course]):
+    """Physics that every mark of a target has to an extent of its own."""
+    signatures = {
+        terms for entry in CATALOGUE for terms in entry.groups if terms[0].driver == "mark"
+    }
+    for target, first in zip(scene.model.targets, scene.first_point, strict=False):
+        if "points" in target.free:
+            continue
+        marks = range(int(first), int(first) + len(target.points))
+        ports = [[term.port for term in terms] for terms in signatures]
+        yield (
+            [Group(each_mark(*own, marks=marks), "target", target=target.name) for own in ports],
+            constant,
+        )
+
+
 def _marks(scene: Scene) -> list[Group]:
     groups = []
     terms = next(entry for entry in CATALOGUE if entry.entity == "mark").groups[0]
@@ -406,10 +522,11 @@ def _marks(scene: Scene) -> list[Group]:
 
 
 def _courses_of_marks(courses: list[Course], n_marks: int) -> list[Course]:
-    """A mark sits wrongly always, from a moment on, or ever more slowly on its adhesive."""
+    """A mark sits wrongly always, from a moment on, ever more slowly, or with temperature."""
     slow = [
         [course for course in courses if course.driver == "time" and course.form == form]
-        for form in ("step", "onset", "creep")
+        for form in ("step", "onset", "creep", "settling")
     ]
+    warm = [c for c in courses if c.form == "linear" and channel_kind(c.driver) == "temperature"]
     every = math.ceil(max(n_marks * sum(map(len, slow)) / _MOST_OF_MARKS, 1.0))
-    return [courses[0], *(course for own in slow for course in own[::every])]
+    return [courses[0], *warm, *(course for own in slow for course in own[::every])]

@@ -1,92 +1,199 @@
-"""Rivals: hypotheses that the recording can't tell from the chosen one at 20:1."""
+"""Rivals: what the recording can't tell from the chosen hypothesis at 20:1.
 
-from dataclasses import dataclass, replace
+With e the chosen effect as it stands in the residuals and lambda = |e|^2 its drop of chi-square, a
+hypothesis that explains the share rho^2 of e is worse by lambda (1 - rho^2): what the recording can
+be expected to show. What it did show counts, too: of refitted hypotheses, and of leading ones that
+were not worth a refit, as one tangent foretells it.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from jaxvm.discover.accept import Accepted
 from jaxvm.discover.cells import Arrangement
-from jaxvm.discover.hypotheses import Hypothesis
-from jaxvm.discover.score import Battery, score_residuals, top
-from jaxvm.discover.select import DECIDED, identity, log_prior, stacked
+from jaxvm.discover.hypotheses import Course, Family, Hypothesis, member
+from jaxvm.discover.score import Battery, Ranking, battery, score_residuals
+from jaxvm.discover.select import DECIDED, log_prior, price_of_columns, stacked
+from jaxvm.physics.effects import Effect
 from jaxvm.solve.adjust import Adjustment
+
+MOST = 8
+"""Rivals that are kept."""
+
+_ODDS = 20.0
 
 
 @dataclass(frozen=True)
 class Rival:
-    """A hypothesis that the recording can't tell from the chosen one."""
+    """A hypothesis that the recording can't tell from the chosen one.
+
+    Attributes:
+        hypothesis: what it is.
+        gap: by how much it is expected to be worse (chi-square).
+        weight: posterior weight among all doubles.
+        drivers: others that this physics may follow as well.
+    """
 
     hypothesis: Hypothesis
     gap: float
     weight: float
+    drivers: tuple[str, ...] = ()
+
+
+@dataclass
+class _Claim:
+    """One name at one place, with all drivers that do."""
+
+    hypothesis: Hypothesis
+    gap: float
+    log_odds: float
+    of_driver: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def weight(self) -> float:
+        return float(np.logaddexp.reduce(list(self.of_driver.values())))
 
 
 def rivals(
     before: Adjustment,
+    after: Adjustment,
+    own: Hypothesis,
+    effect: Effect,
     arrangement: Arrangement,
-    battery: Battery,
-    accepted: Accepted,
-    leading,
+    asked: Battery,
     n: int,
-    signs: np.ndarray,
-) -> tuple[float, list[Rival]]:
-    """Hypotheses that the recording can't tell from the chosen one at 20:1.
+    shown: Iterable[tuple[Hypothesis, np.ndarray, float]] = (),
+) -> tuple[Rival, list[Rival]]:
+    """The chosen hypothesis among its rivals, which are sorted by weight.
 
-    With e the chosen effect as it stands in the residuals and lambda = |e|^2 its drop of
-    chi-square, a hypothesis that explains the share rho^2 of e is worse by lambda (1 - rho^2): what
-    the recording can be expected to show. What it did show counts, too: of refitted ones (`near`),
-    and of `leading` ones that were not worth a refit, as one tangent foretells it.
-    Other names for the chosen combination are always rivals.
+    Other names for the chosen combination are always rivals. One name at one place that may follow
+    several drivers is one rival.
 
-    Returns:
-        The posterior weight of the chosen one, and its rivals with theirs.
+    Args:
+        before, after: the fits without and with the chosen effect.
+        own, effect: what was chosen, and its fitted values.
+        arrangement: of the fit without it.
+        asked: all hypotheses.
+        n: number of pixel coordinates that are fitted.
+        shown: hypotheses that the recording itself shows to be as good, with their amplitudes and
+            by how much their evidence is behind.
     """
-    scene, chosen, near = before.scene, accepted.chosen, accepted.near
-    variance = chosen.adjustment.variance_factor
-    change = stacked(before) - stacked(chosen.adjustment)
+    variance = after.variance_factor
+    change = stacked(before) - stacked(after)
     full = float(np.sum(change**2)) / variance
-    still = np.zeros_like(signs)
-    alike = score_residuals(scene, arrangement, battery, variance, still, residual=change)
-    own_identity = identity(chosen.hypothesis)
-    penalty = len(chosen.effect.amplitudes) + len(chosen.effect.constants)
-    own_prior = log_prior(chosen.hypothesis, np.asarray(chosen.effect.amplitudes))
-    found: dict[tuple, Rival] = {}
+    claims: dict[tuple, _Claim] = {}
+    own_amplitudes = np.asarray(effect.amplitudes)
+    own_prior = log_prior(own, own_amplitudes)
+    own_columns = price_of_columns(own, len(own_amplitudes), full, n)
 
     def weigh(hypothesis: Hypothesis, amplitudes: np.ndarray, gap: float, fit: float) -> None:
         for named in _one_by_one(hypothesis):
-            key = identity(named)
-            log_odds = fit + log_prior(named, np.asarray(amplitudes)) - own_prior
-            if key != own_identity and (key not in found or log_odds > found[key].weight):
-                found[key] = Rival(named, gap, float(log_odds))
+            odds = fit + log_prior(named, np.asarray(amplitudes)) - own_prior
+            claim = claims.setdefault(_claim_of(named), _Claim(named, gap, -np.inf))
+            if odds > claim.log_odds:
+                claim.hypothesis, claim.gap, claim.log_odds = named, gap, float(odds)
+            driver = named.course.driver
+            claim.of_driver[driver] = max(claim.of_driver.get(driver, -np.inf), float(odds))
 
-    for hypothesis, drop, amplitudes in top(alike, scene, 400):
-        gap = max(full - drop / variance, 0.0)
+    scene, epochs = before.scene, len(before.scene.recording.time)
+    still = np.zeros((epochs, 1))
+    found = []
+    refined = _at(asked.families, effect)
+    for some in (asked, battery(scene, arrangement, refined) if refined else None):
+        if some is not None:
+            alike = score_residuals(scene, arrangement, some, variance, still, residual=change)
+            found += list(_resembling(alike, scene, own, full, variance))
+    own_price = min((price for h, _, price, _ in found if h.same(own)), default=0.0)
+    prices = {_course_of(h): price for h, _, price, _ in reversed(found)}
+    for hypothesis, gap, _, amplitudes in found:
         if gap <= DECIDED:
-            cost = len(amplitudes) + len(hypothesis.course.constants) - penalty
-            weigh(hypothesis, amplitudes, float(gap), -0.5 * (gap + cost * np.log(n)))
-    for other in near:
-        behind = chosen.evidence - other.evidence
-        if behind <= DECIDED and not any(
-            r.hypothesis.same(other.hypothesis) for r in found.values()
-        ):
-            amplitudes = np.asarray(other.effect.amplitudes)
-            gap = 2.0 * (other.adjustment.cost - chosen.adjustment.cost) / variance
-            prior = log_prior(other.hypothesis, amplitudes) - own_prior
-            weigh(other.hypothesis, amplitudes, max(float(gap), 0.0), -0.5 * behind - prior)
-    refitted = [candidate.hypothesis for candidate in accepted.tried]
-    foretold = [own for h, own, _ in leading if h.same(chosen.hypothesis)]
-    for hypothesis, own, amplitudes in leading if foretold else ():
-        behind = max(foretold[0] - own, 0.0)
-        named = bool(hypothesis.entries)
-        if named and behind <= DECIDED and not any(r.same(hypothesis) for r in refitted):
+            columns = price_of_columns(hypothesis, len(amplitudes), full - gap, n)
+            cost = columns - own_columns + prices[_course_of(hypothesis)] - own_price
+            weigh(hypothesis, amplitudes, gap, -0.5 * (gap + cost))
+    for hypothesis, amplitudes, behind in shown:
+        if behind <= DECIDED and not hypothesis.same(own):
             prior = log_prior(hypothesis, np.asarray(amplitudes)) - own_prior
-            weigh(hypothesis, amplitudes, behind, -0.5 * behind - prior)
-    weigh(chosen.hypothesis, np.asarray(chosen.effect.amplitudes), 0.0, 0.0)
-    odds = np.array([0.0, *(r.weight for r in found.values())])
-    weights = np.exp(odds - np.logaddexp.reduce(odds))
-    pairs = zip(found.values(), weights[1:], strict=True)
-    kept = [replace(r, weight=float(w)) for r, w in pairs if w >= 0.01]
-    return float(weights[0]), sorted(kept, key=lambda r: -r.weight)
+            weigh(hypothesis, amplitudes, max(behind, 0.0), -0.5 * behind - prior)
+    weigh(own, own_amplitudes, 0.0, 0.0)
+
+    total = np.logaddexp.reduce([claim.weight for claim in claims.values()])
+    weights = {key: float(np.exp(claim.weight - total)) for key, claim in claims.items()}
+    mine = claims.pop(_claim_of(own))
+    least = max(weights.values()) / _ODDS
+    kept = [_rival(claim, weights[key]) for key, claim in claims.items() if weights[key] >= least]
+    chief = replace(_rival(mine, weights[_claim_of(own)], own.course.driver), hypothesis=own)
+    return chief, sorted(kept, key=lambda r: -r.weight)[:MOST]
+
+
+def _rival(claim: _Claim, weight: float, driver: str = "") -> Rival:
+    first = driver or claim.hypothesis.course.driver
+    best = max(claim.of_driver.values())
+    others = sorted(claim.of_driver, key=lambda d: -claim.of_driver[d])
+    near = [d for d in others if d != first and claim.of_driver[d] > best - np.log(_ODDS)]
+    return Rival(claim.hypothesis, claim.gap, weight, tuple(near))
+
+
+def _claim_of(hypothesis: Hypothesis) -> tuple:
+    """What is claimed, whatever drives it: a name, or the terms where there is none; the place."""
+    names = tuple(entry.id for entry in hypothesis.entries[:1]) or hypothesis.group.terms
+    return names, hypothesis.scope
+
+
+def _course_of(hypothesis: Hypothesis) -> tuple:
+    course = hypothesis.course
+    return hypothesis.group, hypothesis.scope, course.driver, course.form
+
+
+def _resembling(ranking: Ranking, scene, own: Hypothesis, full: float, variance: float):
+    """Hypotheses that explain an effect up to the decision limit, and the chosen one.
+
+    Yields (hypothesis, gap, price of its constants, amplitudes). Constants are integrated over
+    their grid: one that may take any value costs nothing, one that must have a single value of
+    the grid costs 2 ln (size of the grid).
+    """
+    for scores in ranking.scores:
+        family = scores.family
+        drops = np.where(scores.valid, scores.drop, -np.inf) / variance
+        kinds: dict[tuple[str, str], list[int]] = {}
+        for place, course in enumerate(family.courses):
+            kinds.setdefault((course.driver, course.form), []).append(place)
+        for (driver, form), places in kinds.items():
+            best = drops[:, places].max(axis=1)
+            mine = (own.course.driver, own.course.form) == (driver, form)
+            for g, s in np.argwhere(best >= full - DECIDED if not mine else np.isfinite(best)):
+                if best[g, s] < full - DECIDED and family.groups[g].terms != own.group.terms:
+                    continue
+                each = drops[g, places, s]
+                mean = 2.0 * np.logaddexp.reduce(0.5 * each) - 2.0 * np.log(len(places))
+                index = (g, places[int(np.argmax(each))], s)
+                gap = float(max(full - best[g, s], 0.0))
+                price = float(best[g, s] - mean)
+                yield member(family, index, scene), gap, price, scores.amplitude[index]
+
+
+def _at(families: tuple[Family, ...], effect: Effect) -> tuple[Family, ...]:
+    """All groups with the refined constants of an effect; none where it has none."""
+    found = []
+    for family in families if effect.constants else ():
+        own = [
+            place
+            for place, course in enumerate(family.courses)
+            if (course.driver, course.form) == (effect.driver, effect.form)
+        ]
+        if own:
+            first = own[0]
+            course = Course(effect.driver, effect.form, effect.constants, effect.reference)
+            found.append(
+                replace(
+                    family,
+                    courses=(course,),
+                    valid=family.valid[:, first : first + 1],
+                    kinds=(family.kinds[first],),
+                    asked=(family.asked[first],),
+                )
+            )
+    return tuple(found)
 
 
 def _one_by_one(hypothesis: Hypothesis) -> list[Hypothesis]:

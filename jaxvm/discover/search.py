@@ -14,7 +14,7 @@ from jaxvm.discover.noise import LONGEST, memory, multipliers
 from jaxvm.discover.revise import prune, rename
 from jaxvm.discover.rivals import rivals
 from jaxvm.discover.score import Battery, Ranking, battery, score_residuals
-from jaxvm.discover.select import refit, shortlist, stacked
+from jaxvm.discover.select import identity, refit, shortlist, stacked
 from jaxvm.solve.adjust import Adjustment
 from jaxvm.solve.covariance import effect_deviations
 from jaxvm.solve.snooping import robust_variance
@@ -66,7 +66,7 @@ class Search:
 
     def run(self, most: int, progress: Callable[[str], None]) -> None:
         """Search until nothing significant is left, at most so many findings are made."""
-        while True:
+        for _ in range(3 * most + 1):
             progress(f"scoring hypotheses (round {len(self.findings) + 1})")
             foremost = self._score()
             if self.p_value > self.alpha or len(self.findings) == most:
@@ -136,14 +136,25 @@ class Search:
         current = replace(accepted.chosen.adjustment, scene=accepted.heldout.scene)
         self.current, self.findings = prune(current, former, parts.n, parts.fit)
         if len(self.findings) < len(former):
+            # What later findings made superfluous does not come back.
+            kept = [finding.hypothesis for finding in self.findings]
+            gone = [f.hypothesis for f in former if f.hypothesis not in kept]
+            self._hopeless |= {(identity(h), h.course) for h in gone}
             self.current, self.heldout = parts.proven(self.current)
             self.findings = self._with_heir(former)
         self.findings = self._confirmed()
 
     def _finding(self, accepted: Accepted, leading) -> Finding:
         chosen, parts, current = accepted.chosen, self.parts, self.current
-        weight, doubles = rivals(
-            current, self._arrangement, self._asked, accepted, leading, parts.n, self._signs
+        chief, doubles = rivals(
+            current,
+            chosen.adjustment,
+            chosen.hypothesis,
+            chosen.effect,
+            self._arrangement,
+            self._asked,
+            parts.n,
+            _as_good(accepted, leading),
         )
         return Finding(
             hypothesis=chosen.hypothesis,
@@ -151,8 +162,9 @@ class Search:
             stds=effect_deviations(chosen.adjustment)[-1],
             final_effect=chosen.effect,
             final_stds=(),
-            weight=weight,
-            rivals=tuple(doubles[:8]),
+            weight=chief.weight,
+            drivers=chief.drivers,
+            rivals=tuple(doubles),
             p_value=self.p_value,
             p_independent=self.p_value,
             z=self.ranking.best_z(),
@@ -213,11 +225,35 @@ class Search:
         if self.p_value > self.alpha:
             # While something is left, names can't be decided better than when they were found.
             self.current, self.findings = rename(self.current, self.findings, parts.n, parts.fit)
+        if len(self.findings) > 1:
+            self.findings = [self._weighed_again(k) for k in range(len(self.findings))]
         if [finding.hypothesis for finding in self.findings] != names:
             self.current, self.heldout = parts.proven(self.current)
             deviations = effect_deviations(self.current)[self.given :]
             pairs = zip(self.findings, deviations, strict=True)
             self.findings = [replace(f, stds=f.stds or own) for f, own in pairs]
+
+    def _weighed_again(self, k: int) -> Finding:
+        """A finding among its rivals with all the others in the model, and with those it had."""
+        finding, scene, parts = self.findings[k], self.current.scene, self.parts
+        effects = scene.fitted_effects()
+        others = (*effects[: self.given + k], *effects[self.given + k + 1 :])
+        without = parts.fit(scene.with_effects(others, scene.room))
+        shown = [
+            (r.hypothesis, np.zeros(0), 2.0 * np.log(max(finding.weight, 1e-9) / r.weight))
+            for r in finding.rivals
+        ]
+        chief, doubles = rivals(
+            without,
+            self.current,
+            finding.hypothesis,
+            effects[self.given + k],
+            arrange(without),
+            self._asked,
+            parts.n,
+            shown,
+        )
+        return replace(finding, weight=chief.weight, drivers=chief.drivers, rivals=tuple(doubles))
 
     def _drop_unconfirmed(self) -> None:
         effects = self.current.scene.fitted_effects()
@@ -226,3 +262,19 @@ class Search:
         scene = self.current.scene
         self.current = self.parts.fit(scene.with_effects(effects, scene.room))
         self.findings = [self.findings[k] for k in kept]
+
+
+def _as_good(accepted: Accepted, leading):
+    """What was refitted and fell behind a little, and named ones that one tangent foretells."""
+    chosen = accepted.chosen
+    for other in accepted.near:
+        yield (
+            other.hypothesis,
+            np.asarray(other.effect.amplitudes),
+            chosen.evidence - other.evidence,
+        )
+    refitted = [candidate.hypothesis for candidate in accepted.tried]
+    foretold = [own for h, own, _ in leading if h.same(chosen.hypothesis)]
+    for hypothesis, own, amplitudes in leading if foretold else ():
+        if hypothesis.entries and not any(r.same(hypothesis) for r in refitted):
+            yield hypothesis, amplitudes, max(foretold[0] - own, 0.0)

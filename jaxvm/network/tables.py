@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Int
 
 from jaxvm.geometry.lenses import lens_family
 from jaxvm.geometry.targets import checker
@@ -48,8 +49,11 @@ class Tables:
         half = np.array([np.ptp(p, axis=0)[:2] / 2 for p in points])
         self.half_size = np.where(half > 0, half, 1.0)
         self.checker = np.concatenate([checker(t.points) for t in self.model.targets])
+        self.along_beam = along_beam(
+            self.station_of, np.asarray(scene.state.station_from_camera)[:, 3:]
+        )
 
-    def circumstances(self, epoch, target, point, pixel, height) -> Circumstances:
+    def circumstances(self, epoch, target, point, pixel, height, along_beam) -> Circumstances:
         velocity = np.zeros((len(epoch), 6))
         for name, values in self.recording.velocities.items():
             own = target == [t.name for t in self.model.targets].index(name)
@@ -63,6 +67,8 @@ class Tables:
                     self.centre[target],
                     self.half_size[target],
                     self.checker[point],
+                    point.astype(float),
+                    along_beam,
                     velocity,
                 ),
             )
@@ -109,7 +115,7 @@ class Tables:
                     weight=jnp.asarray(np.arange(len(chosen)) < real, float),
                     real=jnp.asarray(real),
                     circumstances=self.circumstances(
-                        epoch, target, point, obs.pixel[chosen], height
+                        epoch, target, point, obs.pixel[chosen], height, self.along_beam[camera]
                     ),
                     epoch=jnp.asarray(epoch),
                     pattern=jnp.zeros((len(chosen), 0)),
@@ -136,7 +142,7 @@ class Tables:
             sigma=jnp.asarray(ranges.sigma[:, None]),
             weight=jnp.ones(n),
             circumstances=self.circumstances(
-                ranges.epoch, ranges.target, point, np.zeros((n, 2)), np.ones(n)
+                ranges.epoch, ranges.target, point, np.zeros((n, 2)), np.ones(n), np.full(n, np.nan)
             ),
             to_plane=jnp.asarray(to_plane, float),
             measured=jnp.asarray(ranges.distance),
@@ -252,3 +258,20 @@ def _pose_sigma(sigma_rad: np.ndarray, sigma_m: np.ndarray) -> np.ndarray:
     return np.concatenate(
         [np.repeat(sigma_rad[:, None], 3, axis=1), np.repeat(sigma_m[:, None], 3, axis=1)], axis=1
     )
+
+
+def along_beam(
+    station: Int[np.ndarray, " cameras"], place: Float[np.ndarray, "cameras 3"]
+) -> Float[np.ndarray, " cameras"]:
+    """Place of each camera along the beam of its station, from -1 to 1 over the station's cameras.
+
+    The beam is the direction in which the cameras stand apart most, its middle the middle between
+    the outermost ones. NaN where a station has one camera, or all in one place.
+    """
+    found = np.full(len(station), np.nan)
+    for own in (station == k for k in np.unique(station)):
+        apart = place[own] - place[own].mean(axis=0)
+        along = apart @ np.linalg.svd(apart)[2][0]
+        if np.ptp(along) > 0.0:
+            found[own] = 2.0 * (along - along.min()) / np.ptp(along) - 1.0
+    return found

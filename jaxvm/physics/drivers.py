@@ -42,6 +42,8 @@ OBSERVATION_DRIVERS: dict[str, str] = {
     "target_x": "half width",
     "target_y": "half height",
     "checker": "1",
+    "mark": "1",
+    "along_beam": "1",
     "up_x": "1",
     "up_y": "1",
     "up_z": "1",
@@ -107,7 +109,8 @@ def observation_drivers(
     `row` and `column` from the middle of the image; `incidence` is the angle between the line of
     sight and the target's normal, `incidence_u, _v` the image direction into which the normal
     leans times sin i cos i (the pattern of the eccentricity of circular marks); `checker` is +1 and
-    -1 in turn over the marks of a grid, NaN without one.
+    -1 in turn over the marks of a grid, NaN without one; `mark` is the number of the mark among all
+    targets'; `along_beam` goes from -1 to 1 over the cameras of a station.
     """
     at = circumstances
     world_from_target = pose_from_vector(sight.world_from_target)
@@ -152,6 +155,8 @@ def observation_drivers(
             in_target[0],
             in_target[1],
             at.checker,
+            at.mark,
+            at.along_beam,
             up_cam[0],
             up_cam[1],
             up_cam[2],
@@ -229,8 +234,9 @@ def build_channels(
     """Channels of a recording: its own, time (s since the first epoch), time since power-on.
 
     `power_on` maps a camera to its moments of power-on on the recording's clock (s). Where only the
-    order of the epochs is known (not `timed`), there is "order" in place of "time". Where there are
-    several sessions (`starts`, s), the time since the start of each is a channel, too.
+    order of the epochs is known (not `timed`), there is "order" in place of "time". What is warmer
+    than the air bends: the difference of each temperature against the ambient one is a channel,
+    too. Where there are several sessions (`starts`, s), the time since the start of each is one.
     """
     grid = epoch_time if recorded_time is None else recorded_time
     moments = {name: np.asarray(own, float) for name, own in power_on.items()}
@@ -246,6 +252,7 @@ def build_channels(
         recorded = {name: np.repeat(values, 2) for name, values in recorded.items()}
     rows: dict[str, tuple[str, np.ndarray]] = {"constant": ("constant", np.ones_like(grid))}
     rows |= {name: ("quantity", np.asarray(values)) for name, values in recorded.items()}
+    rows |= {name: ("difference", values) for name, values in _differences(recorded).items()}
     if len(epoch_time) > 1:
         name = "time" if timed else "order"
         rows[name] = (name, grid - epoch_time[0])
@@ -262,6 +269,14 @@ def build_channels(
         names=tuple(rows),
         kinds=tuple(kind for kind, _ in rows.values()),
     )
+
+
+def _differences(recorded: dict[str, Float[np.ndarray, " times"]]) -> dict[str, np.ndarray]:
+    """Temperatures of bodies against that of the air (K)."""
+    warm = [name for name in recorded if channel_kind(name) == "temperature"]
+    air = next((name for name in warm if name.startswith(("ambient", "air"))), "")
+    bodies = [name for name in warm if air and name.startswith("body_")]
+    return {f"{name} - {air}": recorded[name] - recorded[air] for name in bodies}
 
 
 def _since(time: np.ndarray, moments: np.ndarray) -> np.ndarray:

@@ -127,7 +127,8 @@ class Channels(eqx.Module):
         time: grid (s).
         values: one row a channel.
         epoch_time: time of each epoch (s).
-        kinds: for each channel "constant", "quantity", "time", "order" or "power-on".
+        kinds: for each channel "constant", "quantity", "difference" (of two temperatures), "time",
+            "order" or "power-on".
     """
 
     time: Float[Array, " times"]

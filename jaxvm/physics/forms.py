@@ -84,12 +84,16 @@ BASES: dict[str, Callable[[Course, Course, Constants], Course]] = {
     "lag": lambda x, t, c: first_order_lag(x, t, c[0]),
     "slow lag": lambda x, t, c: first_order_lag(x, t, c[1]),
     "rate": lambda x, t, c: rate(x, t),
-    "direction": lambda x, t, c: jnp.tanh(rate(x, t) / c[0]),
+    "aged": lambda x, t, c: x * (t - t[0]) / 3600.0,
+    "direction": lambda x, t, c: jnp.tanh(rate(first_order_lag(x, t, c[1]), t) / c[0]),
     "play": lambda x, t, c: play(x, c[0]) - x,
     "onset": lambda x, t, c: -jnp.expm1(-jnp.maximum(x, 0.0) / c[0]),
     "log": lambda x, t, c: jnp.log1p(jnp.maximum(x, 0.0) / c[0]),
     "step": lambda x, t, c: jnp.where(x >= c[0], 1.0, 0.0),
     "ramp": lambda x, t, c: jnp.maximum(x - c[0], 0.0),
+    "decay": lambda x, t, c: jnp.exp(-jnp.maximum(x, 0.0) / c[0]),
+    "slow decay": lambda x, t, c: jnp.exp(-jnp.maximum(x, 0.0) / c[1]),
+    "staircase": lambda x, t, c: c[0] * (jnp.round(x / c[0] - c[1]) + c[1]),
     "sine": lambda x, t, c: jnp.sin(2.0 * jnp.pi * x / c[0]),
     "cosine": lambda x, t, c: jnp.cos(2.0 * jnp.pi * x / c[0]),
     "transient": lambda x, t, c: x - first_order_lag(x, t, c[0]),
@@ -176,6 +180,13 @@ FORMS: dict[str, Form] = {
             centred=True,
         ),
         Form("proportional", ("linear",), (), "in proportion to {driver} itself"),
+        Form(
+            "ageing",
+            ("linear", "aged"),
+            (),
+            "in proportion to {driver}, more or less so as time goes on",
+            centred=True,
+        ),
         Form("rate", ("rate",), (), "in proportion to the rate of {driver}"),
         Form(
             "transient",
@@ -186,7 +197,7 @@ FORMS: dict[str, Form] = {
         Form(
             "direction",
             ("direction",),
-            (Constant("rate of half play", "driver/h"),),
+            (Constant("rate of half play", "driver/h"), _TAU),
             "with the direction in which {driver} moves",
         ),
         Form(
@@ -197,6 +208,19 @@ FORMS: dict[str, Form] = {
             centred=True,
         ),
         Form("onset", ("onset",), (_TAU,), "settling exponentially with {driver}"),
+        Form(
+            "two decays",
+            ("decay", "slow decay"),
+            (_TAU, Constant("slow time constant", "s")),
+            "fading with two time constants of {driver}",
+        ),
+        Form(
+            "staircase",
+            ("staircase",),
+            (Constant("step", "driver", refined=False), Constant("phase", "1", refined=False)),
+            "in steps of {driver}",
+            centred=True,
+        ),
         Form("creep", ("log",), (_TAU,), "creeping with the logarithm of {driver}"),
         Form(
             "step", ("step",), (Constant("instant", "s", refined=False),), "suddenly, in {driver}"

@@ -7,7 +7,7 @@ chain. Several entries may stand for the same combination: their sizes decide wh
 """
 
 from jaxvm.physics.catalogue.detection import DETECTION
-from jaxvm.physics.catalogue.entry import Entry
+from jaxvm.physics.catalogue.entry import Entry, signature
 from jaxvm.physics.catalogue.lens import LENS
 from jaxvm.physics.catalogue.medium import MEDIUM
 from jaxvm.physics.catalogue.mount import MOUNT
@@ -25,20 +25,22 @@ BY_ID: dict[str, Entry] = {entry.id: entry for entry in CATALOGUE}
 
 
 def entries_for(
-    terms: tuple[Term, ...], driver_kind: str, form: str, channel_kind: str = "quantity"
+    terms: tuple[Term, ...], entity: str, driver_kinds: tuple[str, ...], form: str
 ) -> tuple[Entry, ...]:
     """The entries that a combination of terms, kind of driver and form belongs to.
 
-    `channel_kind` is the kind of a recorded channel, where `driver_kind` is "quantity": where
-    entries name it, those that any recorded quantity may drive are not meant. Several entries are
-    doubles that no recording of these cameras tells apart.
+    `driver_kinds` are the kinds of the driver, general ones first: ("quantity", "temperature",
+    "neighbour"). Where entries name a special kind, those that any recorded quantity may drive are
+    not meant. Several entries are doubles that no recording of these cameras tells apart.
     """
-    special = channel_kind if driver_kind == "quantity" else driver_kind
+    terms = signature(terms)
     known = [
         entry
         for entry in CATALOGUE
         if terms in entry.groups
+        and entity == entry.entity
         and form in entry.forms
-        and (special in entry.drivers or driver_kind in entry.drivers)
+        and any(kind in entry.drivers for kind in driver_kinds)
     ]
-    return tuple([entry for entry in known if special in entry.drivers] or known)
+    special = driver_kinds[1:] or driver_kinds
+    return tuple([e for e in known if any(kind in e.drivers for kind in special)] or known)

@@ -21,7 +21,8 @@ class Entry:
             channel (`jaxvm.physics.drivers.CHANNEL_UNITS`: "temperature", ...), or "quantity", any
             recorded channel.
         forms: forms that the course may take, with any of the drivers.
-        entity: what has it: "camera", "station", "target", "mark" or "rangefinder".
+        entity: what has it: "camera", "station", "target", "face" (a target as one camera sees
+            it), "mark" or "rangefinder".
         plausible: smallest and largest size that is met in practice, in the unit of the first port
             (per unit of the driver where it has one).
         mistaken_for: what looks alike.
@@ -45,7 +46,7 @@ class Entry:
 THERMAL = ("linear", "lag", "two lags")
 """Forms of what follows a quantity, at once or late."""
 
-SETTLING = ("linear", "onset", "creep", "ramp", "settling")
+SETTLING = ("linear", "proportional", "onset", "creep", "ramp", "settling")
 """Forms of what moves slowly one way."""
 
 ALWAYS = ("constant",)
@@ -74,3 +75,20 @@ def pair(a: str, b: str) -> tuple[Terms, ...]:
 def alternatives(*terms: Term) -> tuple[Terms, ...]:
     """Patterned terms together, then each alone."""
     return (terms, *((term,) for term in terms))
+
+
+def each_mark(*ports: str, marks: range = range(1)) -> Terms:
+    """Ports that every mark of a target has for itself.
+
+    The catalogue says what is meant with the first mark; a recording has as many as it has
+    (`signature`).
+    """
+    own = (Term(port, "mark", "bump", (float(k), 0.25), 1.5) for port in ports for k in marks)
+    return tuple(own)
+
+
+def signature(terms: Terms) -> Terms:
+    """Terms as the catalogue writes them: of marks that have something each, the first one."""
+    if terms[0].driver != "mark":
+        return terms
+    return each_mark(*dict.fromkeys(term.port for term in terms))

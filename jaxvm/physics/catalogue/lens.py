@@ -1,6 +1,6 @@
 """Named physics of lenses: principal distance, distortion, decentring, pupil."""
 
-from jaxvm.physics.catalogue.entry import ALWAYS, THERMAL, Entry, Terms, pair, plain
+from jaxvm.physics.catalogue.entry import ALWAYS, THERMAL, Entry, Terms, each_mark, pair, plain
 from jaxvm.physics.effects import Term
 
 _FOCAL, _RADIAL = (plain("sensor.focal"),), (plain("lens.k1"),)
@@ -16,6 +16,9 @@ def _rings(count: int) -> Terms:
 RINGS, FINE_RINGS = _rings(7), _rings(16)
 """Free-form curves of the principal distance over the radius."""
 
+_COMA = (Term("sensor.focal", "radius", "linear"),)
+"""A shift along the radius by its square."""
+
 _RADIAL_FIXED = (
     tuple(Term("sensor.focal", "radius", basis) for basis in ("square", "fourth", "sixth")),
     *((Term("sensor.focal", "radius", basis),) for basis in ("square", "fourth", "sixth")),
@@ -23,21 +26,22 @@ _RADIAL_FIXED = (
     plain("lens.k1"),
     plain("lens.k2"),
     plain("lens.k3"),
+    _COMA,
     RINGS,
     FINE_RINGS,
 )
 
 LENS: tuple[Entry, ...] = (
     Entry(
-        "focal-drift", "the focal length drifts with temperature", (39,),
-        _FOCAL, ("temperature",), THERMAL, "camera",
+        "focal-drift", "the focal length drifts with temperature", (39, 85),
+        _FOCAL, ("temperature",), (*THERMAL, "ageing"), "camera",
         (5e-7, 2e-4), "growth of the target, shift along the axis", "targets at two ranges",
         "The principal distance changes as lens and body expand. All targets grow about the "
         "principal point, at every range.",
     ),
     Entry(
         "device-compensates", "the device changes its own focal length with temperature", (93, 94),
-        _FOCAL, ("temperature",), THERMAL, "camera",
+        _FOCAL, ("temperature",), (*THERMAL, "staircase"), "camera",
         (1e-4, 1e-2), "thermal drift of the focal length",
         "log the device's intrinsics with every frame; switch its compensation off",
         "The firmware rescales the image by a table of temperatures, and nobody logs it. The "
@@ -109,6 +113,13 @@ LENS: tuple[Entry, ...] = (
         "strength. All targets grow about the principal point as the light changes.",
     ),
     Entry(
+        "marks-of-other-colour", "the image scale differs from mark to mark", (49,),
+        (each_mark("sensor.focal"),), ALWAYS, ALWAYS, "target",
+        (1e-5, 1e-2), "displaced marks", "marks of one colour, a filter, other distances",
+        "The lens has another scale for each colour, and the marks are not of one colour. Some "
+        "marks are imaged farther from the centre of the image than others beside them.",
+    ),
+    Entry(
         "distortion-drift", "the distortion drifts with temperature", (43,),
         _RADIAL, ("temperature",), THERMAL, "camera",
         (1e-6, 1e-3), "drift of the focal length", "targets out to the edge of the field",
@@ -117,7 +128,7 @@ LENS: tuple[Entry, ...] = (
     ),
     Entry(
         "defocus-drift", "the spots grow as the lens defocuses with temperature", (40, 72),
-        _RADIAL, ("temperature",), THERMAL, "camera",
+        (*_RADIAL, _COMA), ("temperature",), THERMAL, "camera",
         (1e-6, 1e-3), "drift of the distortion", "record the size of the spots",
         "The lens leaves its focus as it warms, and lopsided spots grow. Their centroids move "
         "along the radius, as if the distortion changed.",
@@ -153,7 +164,7 @@ LENS: tuple[Entry, ...] = (
     ),
     Entry(
         "coma", "the spots are smeared outward", (72,),
-        (*_RADIAL_FIXED, (Term("sensor.focal", "radius", "linear"),)), ALWAYS, ALWAYS, "camera",
+        _RADIAL_FIXED, ALWAYS, ALWAYS, "camera",
         (1e-6, 5e-2), "radial distortion", "another aperture or focus; look at the spots",
         "Coma or defocus makes the image of a mark lopsided, more so towards the edge. Its "
         "centroid moves along the radius, as if the lens distorted.",

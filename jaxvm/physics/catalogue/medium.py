@@ -1,9 +1,12 @@
 """Named physics between target and lens: air and windows."""
 
 from jaxvm.physics.catalogue.entry import ALWAYS, THERMAL, Entry, plain
+from jaxvm.physics.catalogue.maps import image_map
 
 _AIR = ("constant", "gradient", "temperature", "irradiance")
-_AIR_FORMS = ("constant", "linear", "lag")
+_AIR_FORMS = ("constant", "linear", "proportional", "lag")
+_OFF_CENTRE = (plain("sensor.focal"), plain("sensor.focal", "sensor.cx", "sensor.cy"))
+"""A weak lens, on the axis of the camera or beside it."""
 
 MEDIUM: tuple[Entry, ...] = (
     Entry(
@@ -36,15 +39,22 @@ MEDIUM: tuple[Entry, ...] = (
         "targets seem nearer and the field slightly distorted.",
     ),
     Entry(
+        "wet-glass", "a film or drops on the glass bend the image from a moment on", (23,),
+        (image_map(),), ("time",), ("step",), "camera",
+        (1e-3, 5.0), "a jump of the distortion", "wipe the glass; look at the image",
+        "Rain, dew or dirt on the front glass displaces the image smoothly, here one way and there "
+        "another. It came, or went, at one moment.",
+    ),
+    Entry(
         "window-lens-power", "the sun makes the window a lens", (22,),
-        (plain("sensor.focal"),), ("irradiance",), THERMAL, "camera",
+        _OFF_CENTRE, ("irradiance",), THERMAL, "camera",
         (1e-9, 1e-5), "thermal drift of the focal length", "shade the window",
         "The sun heats the window unevenly and its middle gets another index and thickness than "
         "its edge. The window acts as a weak lens that follows the sun.",
     ),
     Entry(
         "window-heats", "the window is a lens while it warms", (22,),
-        (plain("sensor.focal"),), ("temperature",), ("rate", "transient"), "camera",
+        _OFF_CENTRE, ("temperature",), ("rate", "transient"), "camera",
         (1e-6, 5e-4), "thermal drift of the focal length", "hold the temperature: it goes away",
         "While the temperature changes, middle and edge of the window or of the lens are not "
         "equally warm. The glass is a weak lens in proportion to the rate.",

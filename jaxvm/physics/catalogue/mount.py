@@ -4,6 +4,12 @@ from jaxvm.physics.catalogue.entry import ALWAYS, SETTLING, THERMAL, Entry, axes
 from jaxvm.physics.effects import Term
 
 _TURN, _SHIFT = axes("mount.turn"), axes("mount.shift")
+_OPPOSED = (
+    tuple(Term(f"mount.turn_{axis}", "along_beam", "linear") for axis in "xy"),
+    *((Term(f"mount.turn_{axis}", "along_beam", "linear"),) for axis in "xyz"),
+)
+"""Turns in proportion to the place on the beam: against each other at its ends."""
+
 _STATION = axes("station.turn", "station.shift")
 
 MOUNT: tuple[Entry, ...] = (
@@ -44,6 +50,14 @@ MOUNT: tuple[Entry, ...] = (
         "it bends. The turn follows the rate of the temperature and changes sign with it.",
     ),
     Entry(
+        "station-beam-bends", "the beam between the cameras of a station bends", (27,),
+        _OPPOSED, ("irradiance", "gradient", "temperature"),
+        (*THERMAL, "rate", "direction", "transient"), "station",
+        (1e-9, 1e-3), "turn of one mount", "log both sides of the beam",
+        "One side of the beam that carries the cameras is warmer than the other, and it bends. The "
+        "cameras at its ends turn against each other, those in its middle do not.",
+    ),
+    Entry(
         "mount-turn-sun", "the camera turns in its mount in the sun", (25, 82),
         _TURN, ("irradiance",), THERMAL, "camera",
         (1e-9, 1e-5), "the beam under the camera bends", "shade the mount alone",
@@ -52,7 +66,7 @@ MOUNT: tuple[Entry, ...] = (
     ),
     Entry(
         "mount-loaded", "the camera turns with a load or with its neighbour", (37,),
-        _TURN, ("quantity",), THERMAL, "camera",
+        _TURN, ("quantity", "neighbour"), THERMAL, "camera",
         (1e-9, 1e-2), "turn with temperature", "change that quantity alone",
         "A load bends the mount, or the heat of a neighbouring device reaches it. The turn follows "
         "a recorded quantity that is no temperature of its own.",
@@ -77,6 +91,13 @@ MOUNT: tuple[Entry, ...] = (
         (5e-6, 5e-3), "the structure moved", "a second camera on the same station",
         "The camera turned in its mount at one moment. Everything it sees jumps between two "
         "epochs.",
+    ),
+    Entry(
+        "window-refitted", "a wedged window was turned or put before the lens", (21,),
+        _TURN, ("time",), ("step",), "camera",
+        (5e-6, 5e-3), "slip of the mount", "take the window away; an inclinometer on the camera",
+        "A window whose faces are not parallel turns all rays by half its angle. Put in, taken out "
+        "or turned at one moment it makes everything jump as if the camera had turned.",
     ),
     Entry(
         "mount-vibration", "the camera oscillates in its mount", (32,),

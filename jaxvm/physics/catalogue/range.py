@@ -1,12 +1,15 @@
 """Named physics of rangefinders."""
 
-from jaxvm.physics.catalogue.entry import ALWAYS, THERMAL, Entry, plain
+from jaxvm.physics.catalogue.entry import ALWAYS, THERMAL, Entry, pair, plain
 from jaxvm.physics.effects import Term
 
 _INDEX, _SCALE = (plain("range.offset"),), (plain("range.scale"),)
 
-UNITS_M = (0.1, 0.2, 0.5, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0, 20.0)
-"""Half wavelengths of the modulation (m) that a cyclic error is looked for with."""
+UNITS_M = tuple(1.0 / (0.05 + 0.1 * k) for k in range(100))
+"""Half wavelengths of the modulation (m) that a cyclic error is looked for with, 20 m to 0.1 m.
+
+Over a metre of distances neighbours differ by a tenth of a cycle.
+"""
 
 RANGE: tuple[Entry, ...] = (
     Entry(
@@ -62,7 +65,8 @@ RANGE: tuple[Entry, ...] = (
     ),
     Entry(
         "range-beam", "the beam does not meet where it is believed to", (90,),
-        ((Term("range.offset", "incidence", "linear"),),), ALWAYS, ALWAYS, "rangefinder",
+        ((Term("range.offset", "incidence", "linear"),), *pair("mount.turn_x", "mount.turn_y")),
+        ALWAYS, ALWAYS, "rangefinder",
         (5e-5, 2e-2), "index error", "tilt the plate",
         "The beam leaves the rangefinder beside its calibrated place or at another angle. On a "
         "tilted surface this lengthens or shortens the distance.",

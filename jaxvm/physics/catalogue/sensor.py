@@ -1,7 +1,11 @@
 """Named physics of sensors, shutters and clocks."""
 
 from jaxvm.physics.catalogue.entry import ALWAYS, THERMAL, Entry, pair, plain
+from jaxvm.physics.catalogue.maps import height_map
 from jaxvm.physics.effects import Term
+
+SEAMS = tuple(round(0.04 * k, 2) for k in range(-8, 9))
+"""Where the fields of a stitched sensor may join, in image widths from the middle."""
 
 _CENTRE, _DELAY = pair("sensor.cx", "sensor.cy"), (plain("clock.offset"),)
 
@@ -38,7 +42,7 @@ SENSOR: tuple[Entry, ...] = (
     ),
     Entry(
         "self-heating", "the image shifts after power-on", (52,),
-        _CENTRE, ("power-on",), ("onset",), "camera",
+        _CENTRE, ("power-on",), ("onset", "two decays"), "camera",
         (2e-2, 5.0), "ambient temperature, creep", "switch off and on again",
         "The camera heats itself after power-on and the sensor moves. The shift settles "
         "exponentially and returns with every power-on.",
@@ -49,6 +53,13 @@ SENSOR: tuple[Entry, ...] = (
         (1e-4, 1.0), "ambient temperature", "hold frame rate and exposure",
         "The sensor's own heat depends on how often and how long it exposes. The image shifts with "
         "the schedule of the acquisition.",
+    ),
+    Entry(
+        "duty-changed", "the image shifts as the camera settles at another frame rate", (53,),
+        _CENTRE, ("time",), ("settling", "ramp"), "camera",
+        (2e-2, 5.0), "creep of the mount", "log frame rate and exposure; hold them",
+        "From one moment on the sensor exposes more or less often and settles at another "
+        "temperature. The image shifts exponentially from that moment on.",
     ),
     Entry(
         "principal-point-jump", "the principal point jumps", (30, 48, 63),
@@ -80,21 +91,35 @@ SENSOR: tuple[Entry, ...] = (
     ),
     Entry(
         "sensor-unflat", "the sensor is not flat", (54,),
-        tuple(tuple(Term("sensor.focal", driver, basis) for driver in ("image_x", "image_y"))
+        (
+            *(tuple(Term("sensor.focal", driver, basis) for driver in ("image_x", "image_y"))
               for basis in ("linear", "square")),
+            height_map(),
+        ),
         ALWAYS, ALWAYS, "camera",
         (1e-6, 1e-2), "decentring, higher distortion", "roll the camera",
         "The sensor surface deviates from a plane, so the local scale varies over the image. "
         "The pattern is fixed in the image.",
     ),
     Entry(
-        "sensor-stitched", "the sensor is stitched in the middle", (57,),
-        tuple((Term(f"detect.{axis}", along, "step", (0.0,)),)
-              for along in ("column", "row") for axis in "uv"),
+        "sensor-stitched", "the sensor is stitched", (57,),
+        tuple(
+            tuple(Term(f"detect.{axis}", along, "step", (seam,)) for axis in own)
+            for along, seams in (("column", SEAMS), ("row", (0.0,)))
+            for seam in seams
+            for own in ("uv", "u", "v")
+        ),
         ALWAYS, ALWAYS, "camera",
         (5e-4, 1e-1), "pixel locking, unflat sensor", "move a target across the middle",
         "The sensor was exposed in two fields that do not quite fit, or its halves are read out "
         "apart. One half of the image is shifted against the other.",
+    ),
+    Entry(
+        "image-resampled", "the device resamples its image from a moment on", (63,),
+        (plain("sensor.focal", "sensor.cx", "sensor.cy"),), ("time",), ("step",), "camera",
+        (1e-5, 1e-1), "jump of the focal length", "read the binning from the device",
+        "Compression, binning or another read-out scales the image about its first pixel instead "
+        "of the principal point. The image jumps in scale and place at once.",
     ),
     Entry(
         "aspect", "the pixels are not square", (56, 96),
@@ -123,7 +148,7 @@ SENSOR: tuple[Entry, ...] = (
     ),
     Entry(
         "clock-drift", "the camera's clock runs wrong", (61,),
-        _DELAY, ("time",), ("linear",), "camera",
+        _DELAY, ("time",), ("linear", "proportional", "ramp"), "camera",
         (1e-7, 1e-4), "trigger offset", "record for longer",
         "The camera's clock gains or loses. The delay of its exposures grows with time.",
     ),
@@ -150,7 +175,8 @@ SENSOR: tuple[Entry, ...] = (
     ),
     Entry(
         "rolling-shutter", "the shutter rolls", (58, 96),
-        (plain("shutter.row_time"),), ALWAYS, ALWAYS, "camera",
+        (plain("shutter.row_time"), plain("shutter.row_time", "clock.offset")),
+        ALWAYS, ALWAYS, "camera",
         (5e-4, 1e-1), "skew of the sensor", "a static scene, motion the other way",
         "The rows are exposed one after another. Moving targets are sheared or stretched, and the "
         "sign turns with the motion.",

@@ -7,6 +7,7 @@ from jaxvm.physics.catalogue.entry import (
     Entry,
     alternatives,
     axes,
+    each_mark,
     pair,
     plain,
 )
@@ -108,6 +109,13 @@ TARGET: tuple[Entry, ...] = (
         "off the mark's place with the angle at which the mark is seen.",
     ),
     Entry(
+        "marks-of-other-depth", "the marks stand at different depths", (15,),
+        (each_mark("target.point_z"),), ALWAYS, ALWAYS, "target",
+        (5e-6, 5e-3), "a bent plate", "view the target from more directions; measure its marks",
+        "Marks of another make, thicker or domed, have their optical centre before or behind the "
+        "plate. They stand off while the marks beside them don't.",
+    ),
+    Entry(
         "corner-bias", "neighbouring corners are biased to opposite sides", (73,),
         alternatives(Term("target.point_x", "checker", "linear"),
                      Term("target.point_y", "checker", "linear")),
@@ -132,10 +140,24 @@ TARGET: tuple[Entry, ...] = (
     ),
     Entry(
         "mark-creeps", "a mark creeps on its adhesive", (9,),
-        _MARK, ("time",), ("onset", "creep"), "mark",
+        _MARK, ("time",), ("onset", "creep", "settling"), "mark",
         (1e-6, 1e-3), "deformation of the target", "fix the mark mechanically",
         "The adhesive under one mark yields and lets it slide ever more slowly. The marks around "
         "it stay where they are.",
+    ),
+    Entry(
+        "mark-moves-with-heat", "a mark moves with temperature", (9,),
+        _MARK, ("temperature",), ("linear",), "mark",
+        (1e-7, 1e-3), "deformation of the target", "fix the mark mechanically",
+        "Holder or adhesive of one mark expand and carry it. The marks around it stay where they "
+        "are.",
+    ),
+    Entry(
+        "hand-over-plate", "two faces of a plate move against each other", (36,),
+        _PLACE, ("temperature", "irradiance"), THERMAL, "face",
+        (1e-9, 1e-2), "motion of the plate", "watch both faces from one station",
+        "A plate that two stations see from two sides hands the pose over from one to the other. "
+        "Its faces move against each other with temperature, and all that follows is off.",
     ),
     Entry(
         "target-moved", "the target was knocked out of place", (10,),
