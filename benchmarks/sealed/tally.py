@@ -80,7 +80,8 @@ def figures(rows: list[dict]) -> list[Figure]:
     pairs = [r for r in inside if r["n_hidden"] > 1]
     pairs_shown = [r for r in pairs if all(e["shown"] for e in r["effects"])]
     empty = [r for r in rows if not r["n_hidden"]]
-    sizes = [size for r in inside for size in r["set_sizes"]]
+    sizes = [size for r in inside for size in r["set_names"]]
+    claims = [size for r in inside for size in r["set_sizes"]]
     z = [d for r in inside for e in r["effects"] if e["first"] for d in e["z"]]
     constants = [
         d for r in inside for e in r["effects"] if e["first"] for d in e["z_constants"].values()
@@ -107,8 +108,9 @@ def figures(rows: list[dict]) -> list[Figure]:
             "2b", "the same where decidable with a price of ln n for each unknown",
             [e["first"] for _, e in ones if e["decidable_priced"]], 0.0,
         ),
-        _level("3a", "size of the set, median", sizes, 0.5, "at most 2", 2.0),
+        _level("3a", "size of the set (names), median", sizes, 0.5, "at most 2", 2.0),
         _level("3b", "size of the set, 90th percentile", sizes, 0.9, "at most 5", 5.0),
+        _level("3c", "names and places in the set, 90th percentile", claims, 0.9, ""),
         _share(
             "4", "right place and instant where the right name is in the set",
             [e["place_right"] for _, e in shown if e["in_set"]], 0.97,

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxvm.discover.heldout import Gain, HeldOut, Split, gain
-from jaxvm.discover.hypotheses import Hypothesis
-from jaxvm.discover.select import MANY, Candidate, identity, refit
+from jaxvm.discover.hypotheses import FREE, Hypothesis
+from jaxvm.discover.select import Candidate, identity, refit
 from jaxvm.solve.adjust import Adjustment
 
 _CANDIDATES = 4
@@ -17,6 +17,9 @@ STRONG = 20.0
 
 It can't follow the noise of single epochs, and the held-out third alone shows a weak effect badly.
 """
+
+_FREE_LEAST = 40.0
+"""Evidence that a free form must promise before it is fitted: with less it follows noise."""
 
 _TIE = 0.05
 _OPEN = 100.0, 0.02
@@ -57,10 +60,11 @@ def accept(
     for some in (near, rest[:_CANDIDATES]):
         refitted: list[Candidate] = []
         # Free forms come last: what a name explains as well needs no wide fit.
-        for hypothesis, foretold, amplitudes in sorted(some, key=lambda item: len(item[2]) > MANY):
+        for hypothesis, foretold, amplitudes in sorted(some, key=lambda item: len(item[2]) > FREE):
             key = (identity(hypothesis), hypothesis.course)
             best = max((c.evidence for c in refitted), default=-np.inf)
-            if key in hopeless or (len(amplitudes) > MANY and foretold < best):
+            free = len(amplitudes) > FREE
+            if key in hopeless or (free and foretold < max(best, _FREE_LEAST)):
                 continue
             candidate = refit(current, hypothesis, amplitudes, split)
             tried += [] if candidate is None else [candidate]

@@ -167,10 +167,24 @@ def _with_best_instants(final: Adjustment, weights) -> Adjustment:
 
 
 def _with_final_values(final: Adjustment, findings: list[Finding], given: int) -> list[Finding]:
-    """Findings with the values of the fit to all epochs."""
+    """Findings with the values of the fit to all epochs.
+
+    Noise with a memory widens them. An instant that no fit refines keeps the spread of those that
+    did nearly as well.
+    """
     values = zip(final.scene.fitted_effects(), effect_deviations(final), strict=True)
     pairs = zip(findings, list(values)[given:], strict=True)
-    return [replace(f, final_effect=effect, final_stds=stds) for f, (effect, stds) in pairs]
+    return [
+        replace(
+            f,
+            final_effect=effect,
+            final_stds=tuple(
+                float(np.sqrt(f.noise[0])) * own or first
+                for own, first in zip(stds, f.stds or stds, strict=True)
+            ),
+        )
+        for f, (effect, stds) in pairs
+    ]
 
 
 def _table(fitted: Adjustment, heldout: HeldOut | None, scene: Scene, sound) -> ResidualTable:

@@ -30,6 +30,8 @@ class Finding:
         p_value: family-wise, under noise that remembers as long as the residuals do.
         p_independent: the same for noise that is independent from epoch to epoch.
         z: the surprise with which it led its round.
+        noise: its drop under noise that remembers as long as the residuals do is about the first of
+            these numbers times a chi-square with the second as its degrees of freedom.
         n_hypotheses: how many were tried.
         drop: of chi-square in the fitted epochs, by the stated sigmas.
         share: of the plain model's excess chi-square that it explains.
@@ -65,6 +67,7 @@ class Finding:
     chosen: int
     sharing: Sharing | None = None
     advice: tuple[Advice, ...] = ()
+    noise: tuple[float, float] = (1.0, 1.0)
 
 
 @dataclass(frozen=True)

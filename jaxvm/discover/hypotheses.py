@@ -58,8 +58,11 @@ _TWICE = {("target.point_z", "target_x", "square"), ("target.point_z", "target_y
 
 _PATTERNED_PORTS = ("detect.u", "detect.v", "sensor.focal", "target.point_z")
 
-NAMED_ONLY = ("ageing", "staircase", "two decays", "direction")
+NAMED_ONLY = ("turning", "square", "ageing", "staircase", "two decays", "direction")
 """Forms that are asked only where the catalogue names them."""
+
+FREE = 8
+"""A hypothesis with more columns than this is a free form: a curve or a map."""
 
 _MOST_OF_MARKS = 3000
 """Hypotheses about single marks; where marks and instants are many, fewer instants are asked."""
@@ -172,6 +175,8 @@ class Hypothesis:
 _MAPS = {
     "image": "the detector errs by a smooth map over the image",
     "fine image": "the detector errs by a map with fine detail over the image",
+    "finest image": "the detector errs by a map with fine detail over the image",
+    "fine plate": "the target stands off its plane by a smooth surface",
     "plate": "the target stands off its plane by a smooth surface",
 }
 
@@ -252,9 +257,17 @@ def member(family: Family, index: tuple[int, int, int], scene: Scene) -> Hypothe
     kinds = _driver_kinds(family.kinds[index[1]], course.driver, scope)
     entries = entries_for(group.terms, group.entity, kinds, course.form)
     each = len(family.groups) if group.mark is not None else 1
-    asked = {entry.id: each * family.named[entry.id] for entry in entries}
+    asked = {entry.id: each * family.named[entry.id] * _variants(entry, group) for entry in entries}
     asked[""] = each * family.asked[index[1]]
     return Hypothesis(group, course, scope, entries, asked)
+
+
+def _variants(entry: Entry, group: Group) -> int:
+    """Number of groups of an entry that differ in the constants of their patterns alone."""
+    if not any(term.constants for term in group.terms):
+        return 1
+    alike = [(term.port, term.driver, term.basis) for term in group.terms]
+    return sum(alike == [(t.port, t.driver, t.basis) for t in own] for own in entry.groups) or 1
 
 
 def _driver_kinds(kind: str, driver: str, scope: Scope) -> tuple[str, ...]:
@@ -330,15 +343,20 @@ def _as_named(scene: Scene, groups: list[Group], courses: list[Course], listed: 
         course.driver: _driver_kinds(driver_kind(scene, course.driver), course.driver, Scope())
         for course in courses
     }
+    # At the ends of a recording a step is a constant, which a map without a name explains.
+    steps = [place for place, course in enumerate(courses) if course.form == "step"]
+    within = steps[len(steps) // 8 : len(steps) - len(steps) // 8]
     together: dict[tuple, list[Group]] = {}
     singles = [Group((Term(port.name),), _entity(port.name)) for port in PORTS]
     for group in [*groups, *singles]:
         entries = [e for e in CATALOGUE if group.terms in e.groups and e.entity == group.entity]
         patterned = _is_patterned(group)
+        many = len(group.terms) > FREE
         own = tuple(
             place
             for place, course in enumerate(courses)
-            if (course.form in NAMED_ONLY or (patterned and (place or group not in listed)))
+            if not (many and course.form == "step" and place not in within)
+            and (course.form in NAMED_ONLY or (patterned and (place or group not in listed)))
             and any(
                 course.form in e.forms and any(kind in e.drivers for kind in kinds[course.driver])
                 for e in entries
@@ -422,6 +440,7 @@ def _courses(scene: Scene) -> list[Course]:
                 *(Course(name, "lag", (float(tau),), reference) for tau in lags),
                 Course(name, "two lags", (float(lags[1]), float(lags[4])), reference),
                 Course(name, "proportional"),
+                Course(name, "square"),
                 Course(name, "rate"),
                 *(Course(name, "transient", (float(tau),)) for tau in lags[:4]),
                 *(
@@ -430,6 +449,10 @@ def _courses(scene: Scene) -> list[Course]:
                     for tau in (0.4 * lags[0], lags[0], lags[2])
                 ),
                 Course(name, "ageing", (), reference),
+                *(
+                    Course(name, "turning", (times * span,), reference)
+                    for times in (4.0, 7.0, 15.0)
+                ),
                 *(
                     Course(name, "staircase", (float(share * width), phase), reference)
                     for share in (0.12, 0.17, 0.22, 0.28, 0.36, 0.45)

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from jaxvm.discover.diagnosis import Finding
-from jaxvm.discover.select import evidence, identity
+from jaxvm.discover.select import evidence, identity, price_of_columns
 from jaxvm.network.scene import Scene
 from jaxvm.physics.forms import FORMS
 from jaxvm.solve.adjust import Adjustment
@@ -27,8 +27,9 @@ def prune(
     groups = [np.arange(columns.start, columns.stop) for columns, _ in current.scene.places()]
     drops = wald_drops(current, groups[given:])
     for k, (finding, drop) in enumerate(zip(findings[:-1], drops, strict=False)):
-        columns = len(finding.effect.amplitudes) + len(finding.effect.constants)
-        if drop / current.variance_factor < columns * np.log(n):
+        drop = drop / current.variance_factor
+        price = price_of_columns(finding.hypothesis, len(finding.effect.amplitudes), drop, n)
+        if drop < price + len(finding.effect.constants) * np.log(n):
             effects = current.scene.fitted_effects()
             kept = (*effects[: given + k], *effects[given + k + 1 :])
             return fit(current.scene.with_effects(kept, current.scene.room)), findings[

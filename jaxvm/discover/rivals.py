@@ -18,8 +18,8 @@ from jaxvm.discover.select import DECIDED, log_prior, price_of_columns, stacked
 from jaxvm.physics.effects import Effect
 from jaxvm.solve.adjust import Adjustment
 
-MOST = 8
-"""Rivals that are kept."""
+MOST, PLACES = 8, 3
+"""Names that are kept, and places of each."""
 
 _ODDS = 20.0
 
@@ -123,7 +123,19 @@ def rivals(
     least = max(weights.values()) / _ODDS
     kept = [_rival(claim, weights[key]) for key, claim in claims.items() if weights[key] >= least]
     chief = replace(_rival(mine, weights[_claim_of(own)], own.course.driver), hypothesis=own)
-    return chief, sorted(kept, key=lambda r: -r.weight)[:MOST]
+    return chief, _foremost(sorted(kept, key=lambda r: -r.weight))
+
+
+def _foremost(ordered: list[Rival]) -> list[Rival]:
+    """The leading names, and the leading places of each."""
+    places: dict[tuple, int] = {}
+    kept = []
+    for rival in ordered:
+        name, _ = _claim_of(rival.hypothesis)
+        if name in places or len(places) < MOST:
+            places[name] = places.get(name, 0) + 1
+            kept += [rival] if places[name] <= PLACES else []
+    return kept
 
 
 def _rival(claim: _Claim, weight: float, driver: str = "") -> Rival:

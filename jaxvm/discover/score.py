@@ -17,11 +17,11 @@ largest statistic over all hypotheses in each repetition gives a family-wise p-v
 independence inside an epoch (wild bootstrap of the scores).
 """
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.special import gammaln
 
 from jaxvm.discover.cells import Arrangement, Cells
 from jaxvm.discover.hypotheses import Family, Hypothesis, member
@@ -52,6 +52,9 @@ class Scores:
         z: the same as a surprise, about -2 ln p, comparable whatever the number of columns.
         amplitude: one-step amplitudes [groups, courses, scopes, columns].
         seen: share of the effect that the model does not absorb.
+        inflation, freedom: the drop under the multipliers is about `inflation` times a chi-square
+            of so many degrees of freedom (Satterthwaite 1946).
+        null: largest z of each group under the multipliers [groups, repetitions].
         valid: hypotheses that were scored.
     """
 
@@ -60,6 +63,9 @@ class Scores:
     z: np.ndarray
     amplitude: np.ndarray
     seen: np.ndarray
+    inflation: np.ndarray
+    freedom: np.ndarray
+    null: np.ndarray
     valid: np.ndarray
     variance: float
 
@@ -84,6 +90,23 @@ class Ranking:
     def best_z(self) -> float:
         """Largest statistic."""
         return max((float(s.z[s.valid].max()) for s in self.scores if s.n), default=-np.inf)
+
+    def left_at(self, ports: set[str], scope: Scope) -> float:
+        """Probability that noise alone gives as much as is left at some ports of some bodies.
+
+        The family is that of the hypotheses about these ports, of any course: what the best course
+        of its kind should have explained.
+        """
+        p, families = 1.0, 0
+        for scores in self.scores:
+            for g, group in enumerate(scores.family.groups):
+                own = [s for s, other in enumerate(scores.family.scopes) if other == scope]
+                z = np.where(scores.valid[g][:, own], scores.z[g][:, own], -np.inf)
+                if {term.port for term in group.terms} <= ports and np.isfinite(z).any():
+                    null = scores.null[g]
+                    p = min(p, float((1 + np.sum(null >= z.max())) / (1 + len(null))))
+                    families += 1
+        return min(p * max(families, 1), 1.0)
 
     def p_value(self, z: float) -> float:
         """Probability that noise alone gives a statistic this large anywhere (family-wise)."""
@@ -124,11 +147,16 @@ def score_residuals(
     variance: float,
     signs: np.ndarray,
     residual: np.ndarray | None = None,
+    studentised: bool = False,
 ) -> Ranking:
     """Score all hypotheses against the arranged residuals, or against another vector.
 
     `variance` is that of unit weight; `signs` [epochs, repetitions] flip whole epochs for the null
     distribution (`jaxvm.discover.noise.multipliers`); all zero where it is not wanted.
+
+    Noise with a memory makes smooth hypotheses look good and hardly touches the others. With
+    `studentised` each statistic is compared with its own distribution under the multipliers:
+    every hypothesis is judged by the noise that it meets.
 
     With another vector e (whitened, like all observations, and orthogonal to the model's
     tangents) the drop is the part of |e|^2 that a hypothesis explains: how much it resembles e.
@@ -144,18 +172,21 @@ def score_residuals(
         ports, patterns = _group_arrays(scene, arrangement, family)
         valid = family.valid.reshape(len(family.groups), -1)[:, used]
         pairs = _Pairs.of(weights, cells)
-        scored = []
-        for own in zip(ports, patterns, valid, strict=True):
-            *found, largest = _score_group(common, *own[:2], pairs, own[2], signs, variance)
-            null = np.maximum(null, largest)
+        scored, largest = [], np.full((len(family.groups), signs.shape[1]), -np.inf)
+        for g, own in enumerate(zip(ports, patterns, valid, strict=True)):
+            *found, largest[g] = _score_group(
+                common, *own[:2], pairs, own[2], signs, variance, studentised
+            )
             scored.append(found)
-        drop, z, amplitude, seen, sound = (
+        null = np.maximum(null, largest.max(axis=0))
+        drop, z, amplitude, seen, inflation, freedom, sound = (
             _spread(np.stack(values), used, family.valid.shape, fill)
             for values, fill in zip(
-                zip(*scored, strict=True), (0.0, -np.inf, 0.0, 0.0, False), strict=True
+                zip(*scored, strict=True), (0.0, -np.inf, 0.0, 0.0, 1.0, 1.0, False), strict=True
             )
         )
-        results.append(Scores(family, drop, z, amplitude, seen, sound, variance))
+        found = drop, z, amplitude, seen, inflation, freedom, largest, sound
+        results.append(Scores(family, *found, variance))
     return Ranking(tuple(results), null)
 
 
@@ -282,8 +313,9 @@ def _score_group(
     valid: Bool[np.ndarray, " b"],
     signs: Float[np.ndarray, "epochs repetitions"],
     variance: float,
+    studentised: bool,
 ):
-    """Drop, z, amplitudes, visible share, soundness [b, ...], and the largest z per repetition.
+    """Drop, z, amplitudes, visible share, inflation, freedom, soundness [b, ...]; the largest z.
 
     Few large matrix products, in NumPy: a compiled program for every shape of a family would take
     longer to make than to run.
@@ -350,14 +382,22 @@ def _score_group(
     carried = total**2 / np.maximum(np.sum(weight_square**2, axis=1), 1e-300)
     fewest = min(FEWEST_EPOCHS, 0.5 * len(cells.epoch))
     sound = valid & (seen > 1e-6) & (total > 0.0) & (carried >= fewest)
-    z = np.where(sound, surprise(drop / variance, columns), -np.inf)
+    inflation, freedom = np.ones(b), np.full(b, float(columns))
     largest = np.full(signs.shape[1], -np.inf)
     if signs.any() and sound.any():  # all zero: the null distribution is not wanted
         # A fitted residual lacks what the shared unknowns take of its epoch, about 1/epochs.
         lost = max(1.0 - 1.0 / common.n_fitted, 0.5)
-        null = np.sum((part_w[sound] @ signs) ** 2, axis=1).max(axis=0) / lost
-        largest = surprise(null / variance, columns)
-    return drop, z, amplitude, seen, sound, largest
+        null = np.sum((part_w[sound] @ signs) ** 2, axis=1) / (lost * variance)
+        if studentised:
+            mean, spread = null.mean(axis=1), null.var(axis=1)
+            inflation[sound] = np.maximum(0.5 * spread / mean, 1.0)
+            freedom[sound] = np.clip(2.0 * mean**2 / spread, 1.0, columns)
+            of = inflation[sound, None], freedom[sound, None]
+            largest = surprise(null / of[0], of[1]).max(axis=0)
+        else:
+            largest = surprise(null.max(axis=0), columns)
+    z = np.where(sound, surprise(drop / variance / inflation, freedom), -np.inf)
+    return drop, z, amplitude, seen, inflation, freedom, sound, largest
 
 
 def _without_local(cells: Cells) -> Float[np.ndarray, "cells rows"]:
@@ -376,14 +416,17 @@ def _without_local(cells: Cells) -> Float[np.ndarray, "cells rows"]:
     return cells.residual - np.einsum("dn,nrd->nr", back, half)
 
 
-def surprise(chi_square: Float[np.ndarray, "..."], columns: int) -> Float[np.ndarray, "..."]:
+def surprise(
+    chi_square: Float[np.ndarray, "..."], columns: Float[np.ndarray, "..."] | float
+) -> Float[np.ndarray, "..."]:
     """About -2 ln p of a chi-square statistic: comparable whatever the number of columns.
 
     The leading term of the upper tail, p ~ x^(s-1) e^-x / Gamma(s) with s = columns/2, x = half the
     statistic; below the mean, where it does not hold, the statistic is taken at the mean.
     """
     x = 0.5 * np.maximum(chi_square, columns)
-    return 2.0 * (x - (0.5 * columns - 1.0) * np.log(x) + math.lgamma(0.5 * columns))
+    half = 0.5 * np.asarray(columns, float)
+    return 2.0 * (x - (half - 1.0) * np.log(x) + gammaln(half))
 
 
 def top(ranking: Ranking, scene: Scene, count: int) -> list[tuple[Hypothesis, float, np.ndarray]]:
@@ -408,3 +451,45 @@ def top(ranking: Ranking, scene: Scene, count: int) -> list[tuple[Hypothesis, fl
         (member(s.family, index, scene), float(s.drop[index]), s.amplitude[index])
         for _, s, index in entries[:count]
     ]
+
+
+def spread_of_constant(ranking: Ranking, hypothesis: Hypothesis, scene: Scene) -> float:
+    """Standard deviation of the first constant of a hypothesis over the courses that were asked.
+
+    The posterior over the grid, with a flat prior: weights exp(drop / 2). It is not less than what
+    the step of the grid leaves open.
+    """
+    for scores, g, own, s in _where(ranking, hypothesis, scene):
+        at = np.array([scores.family.courses[k].constants[0] for k in own])
+        drop = np.where(scores.valid[g, own, s], scores.drop[g, own, s], -np.inf)
+        weight = np.exp(0.5 * (drop - drop.max()) / scores.variance)
+        mean = float(weight @ at / weight.sum())
+        step = float(np.median(np.diff(np.unique(at)))) if len(at) > 1 else 0.0
+        return float(np.hypot(np.sqrt(weight @ (at - mean) ** 2 / weight.sum()), step / 3.5))
+    return 0.0
+
+
+def noise_of(ranking: Ranking, hypothesis: Hypothesis, scene: Scene) -> tuple[float, float] | None:
+    """Inflation and freedom of a hypothesis under the multipliers, at its most inflated course.
+
+    None where it was not scored: the model has it already.
+    """
+    met = [
+        (float(scores.inflation[g, k, s]), float(scores.freedom[g, k, s]))
+        for scores, g, own, s in _where(ranking, hypothesis, scene)
+        for k in own
+        if scores.valid[g, k, s]
+    ]
+    return max(met, default=None)
+
+
+def _where(ranking: Ranking, hypothesis: Hypothesis, scene: Scene):
+    """Scores, group, courses and scope of a hypothesis, whatever its constants."""
+    kind = hypothesis.course.driver, hypothesis.course.form
+    for scores in ranking.scores:
+        family = scores.family
+        own = [k for k, c in enumerate(family.courses) if (c.driver, c.form) == kind]
+        for g in (g for g, group in enumerate(family.groups) if group == hypothesis.group and own):
+            for s in map(int, np.flatnonzero(scores.valid[g, own].any(axis=0))):
+                if member(family, (g, own[0], s), scene).scope == hypothesis.scope:
+                    yield scores, g, own, s

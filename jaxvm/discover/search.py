@@ -7,20 +7,36 @@ import numpy as np
 
 from jaxvm.discover.accept import Accepted, accept, short
 from jaxvm.discover.cells import Arrangement, arrange
+from jaxvm.discover.detail import with_detail
 from jaxvm.discover.diagnosis import Finding
 from jaxvm.discover.heldout import HeldOut, Split
 from jaxvm.discover.hypotheses import enumerate_hypotheses
 from jaxvm.discover.noise import LONGEST, memory, multipliers
 from jaxvm.discover.revise import prune, rename
 from jaxvm.discover.rivals import rivals
-from jaxvm.discover.score import Battery, Ranking, battery, score_residuals
-from jaxvm.discover.select import identity, refit, shortlist, stacked
+from jaxvm.discover.score import (
+    Battery,
+    Ranking,
+    battery,
+    noise_of,
+    score_residuals,
+    spread_of_constant,
+    surprise,
+)
+from jaxvm.discover.select import Candidate, identity, refit, shortlist, stacked
+from jaxvm.physics.forms import FORMS
 from jaxvm.solve.adjust import Adjustment
 from jaxvm.solve.covariance import effect_deviations
 from jaxvm.solve.snooping import robust_variance
 
 ALPHA = 0.01
 """Family-wise probability to claim something where nothing is hidden."""
+
+DOUBT = 0.1
+"""Probability that a name is wrong where something significant is left that no name explains."""
+
+DOUBTFUL = 0.05
+"""Probability of what is left at a finding's own ports from which its course is doubted."""
 
 FLIPS = 199
 """Repetitions of the null distribution."""
@@ -106,9 +122,17 @@ class Search:
             self.p_value = self._p_without(*foremost[0][::2])
         return foremost
 
-    def _scores(self, variance: float, signs: np.ndarray, residual=None) -> Ranking:
+    def _scores(
+        self, variance: float, signs: np.ndarray, residual=None, studentised: bool = False
+    ) -> Ranking:
         return score_residuals(
-            self.current.scene, self._arrangement, self._asked, variance, signs, residual
+            self.current.scene,
+            self._arrangement,
+            self._asked,
+            variance,
+            signs,
+            residual,
+            studentised,
         )
 
     def _p_without(self, hypothesis, amplitudes) -> float:
@@ -159,7 +183,7 @@ class Search:
         return Finding(
             hypothesis=chosen.hypothesis,
             effect=chosen.effect,
-            stds=effect_deviations(chosen.adjustment)[-1],
+            stds=self._deviations(chosen),
             final_effect=chosen.effect,
             final_stds=(),
             weight=chief.weight,
@@ -179,20 +203,29 @@ class Search:
             chosen=next(k for k, (h, *_) in enumerate(leading) if h.same(chosen.hypothesis)),
         )
 
+    def _deviations(self, chosen: Candidate) -> tuple[float, ...]:
+        """Standard deviations of amplitudes and constants; of an instant by its posterior."""
+        stds = effect_deviations(chosen.adjustment)[-1]
+        form = FORMS[chosen.hypothesis.course.form]
+        if not form.constants or form.constants[0].refined:
+            return stds
+        spread = spread_of_constant(self.ranking, chosen.hypothesis, self.current.scene)
+        return (*stds[: chosen.effect.n_columns], spread, *stds[chosen.effect.n_columns + 1 :])
+
     def _with_heir(self, former: list[Finding]) -> list[Finding]:
         """Findings after some were dropped: what those showed, the strongest one shows now."""
         findings = list(self.findings)
         if not findings:
             return findings
-        kept = {id(finding) for finding in findings}
-        lost = max(finding.z for finding in former if id(finding) not in kept)
         effects, scene = self.current.scene.fitted_effects(), self.current.scene
         without = (
             scene.with_effects((*effects[:k], *effects[k + 1 :]), scene.room)
             for k in range(len(effects) - len(findings), len(effects))
         )
-        heir = int(np.argmax([self.parts.fit(scene).cost for scene in without]))
-        findings[heir] = replace(findings[heir], z=max(findings[heir].z, lost))
+        costs = [self.parts.fit(scene).cost for scene in without]
+        heir = int(np.argmax(costs))
+        drop = 2.0 * (costs[heir] - self.current.cost)
+        findings[heir] = replace(findings[heir], drop=max(findings[heir].drop, drop))
         return findings
 
     def _confirmed(self) -> list[Finding]:
@@ -210,8 +243,17 @@ class Search:
         n_epochs = len(scene.recording.time)
         window = min(2 * window, max(int(LONGEST * n_epochs), 2))
         remembering = multipliers(n_epochs, window, FLIPS, self.seed)
-        left = self._scores(robust_variance(self.current), remembering, stacked(self.current))
-        return [replace(f, p_value=max(left.p_value(f.z), f.p_independent)) for f in self.findings]
+        variance = robust_variance(self.current)
+        left = self._scores(variance, remembering, stacked(self.current), studentised=True)
+
+        def again(finding: Finding) -> Finding:
+            met = noise_of(left, finding.hypothesis, scene) or (1.0, 1.0)
+            inflation, freedom = max(met, finding.noise)
+            z = float(surprise(np.array(finding.drop / variance / inflation), freedom))
+            p = max(left.p_value(z), finding.p_independent)
+            return replace(finding, p_value=p, noise=(inflation, freedom))
+
+        return [again(finding) for finding in self.findings]
 
     def _settle(self) -> None:
         """Drop what noise with a memory explains, and give the findings their last names."""
@@ -232,6 +274,24 @@ class Search:
             deviations = effect_deviations(self.current)[self.given :]
             pairs = zip(self.findings, deviations, strict=True)
             self.findings = [replace(f, stds=f.stds or own) for f, own in pairs]
+        self.current, self.heldout, self.findings = with_detail(
+            self.current, self.heldout, self.findings, parts, self.seed
+        )
+        self.findings = [self._doubted(finding) for finding in self.findings]
+
+    def _doubted(self, finding: Finding) -> Finding:
+        """A finding's weights where something is left: it may be that of which this is a part.
+
+        What is left need not be significant among all hypotheses; at the finding's own ports it
+        speaks against the course that was named.
+        """
+        ports = {term.port for term in finding.effect.terms}
+        left = self.ranking.left_at(ports, finding.effect.scope)
+        if self.p_value > self.alpha and left > DOUBTFUL:
+            return finding
+        sure = 1.0 - DOUBT
+        others = tuple(replace(r, weight=sure * r.weight) for r in finding.rivals)
+        return replace(finding, weight=sure * finding.weight, rivals=others)
 
     def _weighed_again(self, k: int) -> Finding:
         """A finding among its rivals with all the others in the model, and with those it had."""

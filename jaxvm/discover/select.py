@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from jaxvm.discover.heldout import Split
-from jaxvm.discover.hypotheses import Hypothesis
+from jaxvm.discover.hypotheses import FREE, Hypothesis
 from jaxvm.discover.score import Ranking, top
 from jaxvm.network.scene import Scene
 from jaxvm.physics.catalogue import Entry
@@ -26,14 +26,17 @@ CLEAR = 15.0
 
 _RTOL, _MAX_STEPS = 1e-6, 14
 
-MANY = 8
-"""A hypothesis with more columns than this is a free form: a curve or a map."""
+_WIDE = 3.0
+"""Prior standard deviation of the amplitudes of a free form, over their median size."""
 
 _SHARP = 0.3
 """Information on the log of a constant per unit of drop of chi-square, times its prior's width.
 
 A time constant that is off by a factor of e leaves about a tenth of an effect unexplained.
 """
+
+_MIMICRY = 0.1
+"""Weight of a named free form: it can mimic much that has another name, or none."""
 
 UNNAMED_PRIOR = 0.01
 """Weight of a hypothesis that no engineer has a name for, against one of the catalogue."""
@@ -60,8 +63,9 @@ def log_prior(hypothesis: Hypothesis, amplitudes: np.ndarray) -> float:
     courses that happens to fit a little better is no better than the only constant.
     """
     asked = hypothesis.alternatives
+    mimicry = np.log(_MIMICRY) if len(hypothesis.group.terms) > FREE else 0.0
     own = [
-        _log_size(entry, hypothesis, amplitudes) - np.log(asked.get(entry.id, 1))
+        _log_size(entry, hypothesis, amplitudes) - np.log(asked.get(entry.id, 1)) + mimicry
         for entry in hypothesis.entries
     ]
     return float(max([*own, np.log(UNNAMED_PRIOR) - np.log(asked.get("", 1))]))
@@ -105,7 +109,7 @@ def price_of_columns(hypothesis: Hypothesis, columns: int, drop: float, n: int) 
     show (empirical Bayes), and costs 1 + ln(drop / columns) for each of them, which is less than
     the ln n of a single unknown.
     """
-    if columns > MANY and hypothesis.course.form not in N_KNOTS:
+    if columns > FREE and hypothesis.course.form not in N_KNOTS:
         return float(columns * min(np.log(n), 1.0 + np.log(max(drop / columns, 1.0))))
     return float(columns * np.log(n))
 
@@ -151,7 +155,7 @@ def refit(base: Adjustment, hypothesis: Hypothesis, amplitudes, split: Split) ->
     effects = (*base.scene.fitted_effects(), hypothesis.effect(0.0 * amplitudes))
     scene = base.scene.with_effects(effects, room_for(effects, base.scene.room))
 
-    def fit(active=None):
+    def fit(scene: Scene, active=None):
         return adjust(
             scene,
             weights=split.weights,
@@ -163,11 +167,18 @@ def refit(base: Adjustment, hypothesis: Hypothesis, amplitudes, split: Split) ->
             check=False,
         )
 
-    fitted = fit()
+    fitted = fit(scene)
     effect = fitted.scene.fitted_effects()[-1]
+    if len(amplitudes) > FREE:
+        # What some tiles or knots can't know, the others tell: their spread (empirical Bayes).
+        size = float(np.median(np.abs(effect.amplitudes)))
+        own = replace(hypothesis.effect(0.0 * amplitudes), spread=_WIDE * size)
+        scene = scene.with_effects((*effects[:-1], own), scene.room)
+        fitted = fit(scene)
+        effect = fitted.scene.fitted_effects()[-1]
     if effect.constants and not (fitted.converged and _sensible(scene, effect)):
         # The grid's constants are good enough when a refined one runs away.
-        fitted = fit(hypothesis_constants_held(scene))
+        fitted = fit(scene, hypothesis_constants_held(scene))
         effect = fitted.scene.fitted_effects()[-1]
     if fitted.failed:
         return None
@@ -176,7 +187,7 @@ def refit(base: Adjustment, hypothesis: Hypothesis, amplitudes, split: Split) ->
     own = evidence(hypothesis, drop, np.asarray(effect.amplitudes), variance, split.n)
     # Of several names for the same the size decides which comes first.
     named = best_named(hypothesis, np.asarray(effect.amplitudes))
-    known = (*effects[:-1], named.effect(0.0 * amplitudes))
+    known = (*effects[:-1], replace(named.effect(0.0 * amplitudes), spread=effect.spread))
     fitted = replace(fitted, scene=replace(fitted.scene, effects=known))
     return Candidate(named, fitted, own)
 

@@ -80,6 +80,10 @@ def _with_amplitude_priors(scene: Scene, network: Network) -> Network:
     used = (reach > 0) & (limit > 0)
     slots = network.layout.all("amplitude")
     sigma = np.where(used, limit, 1.0) / np.where(used, reach, 1.0)
+    own_spread = np.zeros(n_columns)
+    for effect, (columns, _) in zip(scene.effects, scene.places(), strict=True):
+        own_spread[columns] = effect.spread
+    sigma = np.where(own_spread > 0.0, own_spread, sigma)
     own_priors = PriorFactor(
         slots=jnp.asarray(slots[:, None]),
         sigma=jnp.asarray(sigma[:, None]),

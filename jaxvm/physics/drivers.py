@@ -56,7 +56,9 @@ OBSERVATION_DRIVERS: dict[str, str] = {
 PLANES: dict[str, tuple[str, str, float]] = {
     "image": ("image_x", "image_y", 0.4),
     "fine image": ("image_x", "image_y", 0.22),
+    "finest image": ("image_x", "image_y", 0.095),
     "plate": ("target_x", "target_y", 0.5),
+    "fine plate": ("target_x", "target_y", 0.25),
 }
 """Two observation-like drivers together, and the spacing of the tiles of a map over them."""
 

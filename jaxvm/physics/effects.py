@@ -74,6 +74,7 @@ class Effect:
         amplitudes: one for each term and basis, term by term, in the unit of the port per unit of
             the driver.
         catalogue_id: entry of the catalogue, "" where it has no name.
+        spread: prior standard deviation of every amplitude; 0 for that of its port.
     """
 
     name: str
@@ -85,6 +86,7 @@ class Effect:
     scope: Scope = field(default_factory=Scope)
     amplitudes: tuple[float, ...] = ()
     catalogue_id: str = ""
+    spread: float = 0.0
 
     @property
     def n_columns(self) -> int:
@@ -101,6 +103,7 @@ class Effect:
         return {
             "name": self.name,
             "catalogue_id": self.catalogue_id,
+            "spread": float(self.spread),
             "terms": terms,
             "driver": self.driver,
             "form": self.form,

@@ -94,6 +94,8 @@ BASES: dict[str, Callable[[Course, Course, Constants], Course]] = {
     "decay": lambda x, t, c: jnp.exp(-jnp.maximum(x, 0.0) / c[0]),
     "slow decay": lambda x, t, c: jnp.exp(-jnp.maximum(x, 0.0) / c[1]),
     "staircase": lambda x, t, c: c[0] * (jnp.round(x / c[0] - c[1]) + c[1]),
+    "turned": lambda x, t, c: x * jnp.cos(2.0 * jnp.pi * (t - t[0]) / c[0]),
+    "turned aside": lambda x, t, c: x * jnp.sin(2.0 * jnp.pi * (t - t[0]) / c[0]),
     "sine": lambda x, t, c: jnp.sin(2.0 * jnp.pi * x / c[0]),
     "cosine": lambda x, t, c: jnp.cos(2.0 * jnp.pi * x / c[0]),
     "transient": lambda x, t, c: x - first_order_lag(x, t, c[0]),
@@ -180,6 +182,7 @@ FORMS: dict[str, Form] = {
             centred=True,
         ),
         Form("proportional", ("linear",), (), "in proportion to {driver} itself"),
+        Form("square", ("square",), (), "in proportion to the square of {driver} itself"),
         Form(
             "ageing",
             ("linear", "aged"),
@@ -213,6 +216,13 @@ FORMS: dict[str, Form] = {
             ("decay", "slow decay"),
             (_TAU, Constant("slow time constant", "s")),
             "fading with two time constants of {driver}",
+        ),
+        Form(
+            "turning",
+            ("turned", "turned aside"),
+            (Constant("period", "s"),),
+            "with {driver}, from a direction that turns",
+            centred=True,
         ),
         Form(
             "staircase",

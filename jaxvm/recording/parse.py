@@ -328,7 +328,7 @@ def _closure(entry: Entry) -> Closure:
 
 def _effect(entry: Entry, model: Model) -> Effect:
     keys = ("name", "catalogue_id", "driver", "form", "constants", "reference", "scope", "terms",
-            "amplitudes")  # fmt: skip
+            "amplitudes", "spread")  # fmt: skip
     entry.only(keys)
     for key, example in (("terms", '[{port = "target.bow_x"}]'), ("amplitudes", "[0.001]")):
         entry.needs(key, example)
@@ -350,6 +350,7 @@ def _effect(entry: Entry, model: Model) -> Effect:
         scope=_scope(entry.entry("scope"), model),
         amplitudes=tuple(amplitudes.tolist()),
         catalogue_id=entry.string("catalogue_id", ""),
+        spread=entry.number("spread", 0.0) or 0.0,
     )
 
 

@@ -210,21 +210,22 @@ def _assembled(
         square = jnp.sum(r**2, axis=1)
         cost = cost + 0.5 * jnp.sum(loss.value(square))
         root = jnp.sqrt(loss.weight(square))[:, None]
-        gram, product = packet_products(packets, table.jacobian * root[:, :, None], r * root)
         place, group, member = split_columns(packets.columns, sizes)
-        # What a packet has to itself is scattered; what all have in common (effects) is summed
-        # first, for it is most of a wide model.
+        # What a packet has to itself is scattered; what all have in common (effects) is one product
+        # of matrices, for it is most of a wide model.
         k = sum(at < n_own for at in packets.live)
         common = place[0, k:]
         place, member = place[:, :k], member[:, :k]
-        gradient = gradient.at[packets.columns[:, :k]].add(product[:, :k])
-        gradient = gradient.at[packets.columns[0, k:]].add(jnp.sum(product[:, k:], axis=0))
-        own, cross = gram[:, :k, :k], gram[:, :k, k:]
+        jacobian, value = table.jacobian * root[:, :, None], r * root
+        beside = jnp.reshape(jacobian[:, :, k:], (-1, common.shape[0]))
+        apart, product = packet_products(packets, jacobian[:, :, :k], jacobian, value)
+        own, cross = apart[:, :, :k], apart[:, :, k:]
+        gradient = gradient.at[packets.columns[:, :k]].add(product)
+        gradient = gradient.at[packets.columns[0, k:]].add(jnp.ravel(value) @ beside)
         mixed = jnp.zeros((s + 1, common.shape[0])).at[place].add(cross)
         shared = shared.at[place[:, :, None], place[:, None, :]].add(own)
         shared = shared.at[:, common].add(mixed).at[common].add(mixed.T)
-        both = jnp.sum(gram[:, k:, k:], axis=0)
-        shared = shared.at[common[:, None], common].add(both)
+        shared = shared.at[common[:, None], common].add(beside.T @ beside)
         if groups:
             where = group[:, None, None]
             coupling = coupling.at[where, member[:, :, None], place[:, None, :]].add(own)
@@ -238,15 +239,13 @@ def _assembled(
 
 def packet_products(
     packets: Packets,
-    jacobian: Float[Array, "obs comps live"],
-    values: Float[Array, "obs comps *k"],
-) -> tuple[Float[Array, "packets live live"], Float[Array, "packets live *k"]]:
-    """J^T J and J^T values of every packet."""
-    j = in_packets(packets, jacobian)
-    v = in_packets(packets, values if values.ndim == 3 else values[:, :, None])
-    gram = jnp.einsum("prk,prl->pkl", j, j)
-    product = jnp.einsum("prk,prm->pkm", j, v)
-    return gram, product if values.ndim == 3 else product[:, :, 0]
+    left: Float[Array, "obs comps own"],
+    right: Float[Array, "obs comps live"],
+    values: Float[Array, "obs comps"],
+) -> tuple[Float[Array, "packets own live"], Float[Array, "packets own"]]:
+    """Products left^T right and left^T values of every packet."""
+    own, other, v = (in_packets(packets, part) for part in (left, right, values[:, :, None]))
+    return jnp.einsum("prk,prl->pkl", own, other), jnp.einsum("prk,prm->pkm", own, v)[:, :, 0]
 
 
 def in_packets(packets: Packets, values: Float[Array, "obs comps k"]) -> Float[Array, "p r k"]:

@@ -46,7 +46,7 @@ DETECTION: tuple[Entry, ...] = (
     ),
     Entry(
         "side-light", "the light on a target biases its marks", (68,),
-        _SHIFT, ("irradiance", "light"), ("linear", "lag", "ageing"), "target",
+        _SHIFT, ("irradiance", "light"), ("linear", "lag", "turning"), "target",
         (1e-6, 1e-2), "motion of the target", "shade the target; a lamp from the other side",
         "The sunlit side of each mark is brighter and draws its measured centre. The shift grows "
         "with the light and wanders with the azimuth of the sun.",

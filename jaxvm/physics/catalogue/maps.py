@@ -15,6 +15,12 @@ def fine_image_map() -> Terms:
     return _tiles("detect.u", "fine image", 9, 7) + _tiles("detect.v", "fine image", 9, 7)
 
 
+def finest_image_map() -> Terms:
+    """The same with tiles that need a prior to be known."""
+    tiles = [_tiles(f"detect.{axis}", "finest image", 20, 15) for axis in "uv"]
+    return tiles[0] + tiles[1]
+
+
 def height_map() -> Terms:
     """A smooth map of the local principal distance: the height of the sensor's surface."""
     return _tiles("sensor.focal", "image", 5, 4)
@@ -23,6 +29,11 @@ def height_map() -> Terms:
 def plate_map() -> Terms:
     """A smooth surface by which a plate stands off its plane."""
     return _tiles("target.point_z", "plate", 5, 5)
+
+
+def fine_plate_map() -> Terms:
+    """The same with tiles that need a prior to be known."""
+    return _tiles("target.point_z", "fine plate", 11, 11)
 
 
 def _tiles(port: str, plane: str, columns: int, rows: int) -> Terms:

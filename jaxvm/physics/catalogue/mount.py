@@ -107,7 +107,7 @@ MOUNT: tuple[Entry, ...] = (
     ),
     Entry(
         "mount-wind", "the wind turns the camera", (33,),
-        _TURN, ("wind",), ("linear", "quadratic"), "camera",
+        _TURN, ("wind",), ("square", "proportional", "linear", "quadratic"), "camera",
         (1e-8, 1e-4), "vibration of the mount", "shelter the camera",
         "The wind pushes the camera on its mount or tripod, about with the square of its speed. "
         "All targets shift in the image alike.",

@@ -9,6 +9,12 @@ SEAMS = tuple(round(0.04 * k, 2) for k in range(-8, 9))
 
 _CENTRE, _DELAY = pair("sensor.cx", "sensor.cy"), (plain("clock.offset"),)
 
+
+def _sloped(basis: str):
+    """The local principal distance varies over the image as the height of the sensor's surface."""
+    return tuple(Term("sensor.focal", driver, basis) for driver in ("image_x", "image_y"))
+
+
 SENSOR: tuple[Entry, ...] = (
     Entry(
         "principal-point-walk", "the principal point walks with temperature", (51,),
@@ -84,19 +90,14 @@ SENSOR: tuple[Entry, ...] = (
     ),
     Entry(
         "sensor-tilt", "the sensor is tilted against the lens", (55,),
-        pair("lens.tilt_x", "lens.tilt_y"), ALWAYS, ALWAYS, "camera",
+        (*pair("lens.tilt_x", "lens.tilt_y"), _sloped("linear")), ALWAYS, ALWAYS, "camera",
         (1e-4, 5e-2), "decentring, turn of the camera", "a strongly distorting lens",
         "The sensor plane is not normal to the axis. Nearly all of it is absorbed by pose and "
         "principal point; what is left is small.",
     ),
     Entry(
         "sensor-unflat", "the sensor is not flat", (54,),
-        (
-            *(tuple(Term("sensor.focal", driver, basis) for driver in ("image_x", "image_y"))
-              for basis in ("linear", "square")),
-            height_map(),
-        ),
-        ALWAYS, ALWAYS, "camera",
+        (_sloped("square"), height_map()), ALWAYS, ALWAYS, "camera",
         (1e-6, 1e-2), "decentring, higher distortion", "roll the camera",
         "The sensor surface deviates from a plane, so the local scale varies over the image. "
         "The pattern is fixed in the image.",

@@ -53,7 +53,7 @@ TARGET: tuple[Entry, ...] = (
         "target-bends", "the target bends with its surroundings", (7,),
         pair("target.bow_x", "target.bow_y"),
         ("temperature", "humidity", "irradiance", "quantity"),
-        (*THERMAL, "rate", "transient"), "target",
+        (*THERMAL, "rate", "transient", "hysteresis"), "target",
         (1e-8, 1e-3), "drift of the lens distortion", "watch a second target",
         "One-sided warming or moisture bends the plate. The bow follows the driver, often late.",
     ),
