@@ -8,10 +8,17 @@ import numpy as np
 import pytest
 from networks import HELD, IMAGE
 
-from jaxvm.discover.curves import curve_constants, curved_drivers, image_map, plate_map
+from jaxvm.discover.curves import curve_constants, curved_drivers
 from jaxvm.geometry.targets import grid_points
 from jaxvm.network.residual import predict_pixels
 from jaxvm.network.scene import build
+from jaxvm.physics.catalogue.maps import (
+    fine_image_map,
+    fine_plate_map,
+    finest_image_map,
+    image_map,
+    plate_map,
+)
 from jaxvm.physics.drivers import (
     OBSERVATION_DRIVER_INDEX,
     OBSERVATION_DRIVERS,

@@ -51,7 +51,7 @@ class Arrangement:
 
     cells: Cells
     rows: np.ndarray  # [cells, width] into all observations, padded with their number
-    epoch: np.ndarray  # of each cell
+    view: np.ndarray  # of each cell
     drivers: np.ndarray  # observation-like drivers of all observations, NaN where they have none
     starts: tuple[int, ...]  # first observation of each table (pixel tables, then ranges)
     components: int
@@ -79,7 +79,7 @@ def arrange(adjustment: Adjustment) -> Arrangement:
     scene, problem = adjustment.scene, adjustment.problem
     whitened = _whitened(problem, adjustment.x)
     n_groups = problem.sizes[1]
-    keys, drivers, halves, residuals, tangents, starts = [], [], [], [], [], []
+    keys, views, drivers, halves, residuals, tangents, starts = [], [], [], [], [], [], []
     components = max(r.shape[1] for _, r, _ in whitened)
     obs = scene.recording.observations
     tables = zip(problem.network.factors(), problem.packets, whitened, strict=False)
@@ -102,7 +102,9 @@ def arrange(adjustment: Adjustment) -> Arrangement:
             first = len(scene.model.cameras) * len(scene.model.targets)
             entity = first + ranges.rangefinder * len(scene.model.targets) + ranges.target
             drivers.append(np.asarray(range_driver_table(scene, factor))[:n])
-        keys.append(np.stack([group, np.asarray(factor.epoch)[:n], entity], axis=1))
+        views.append(np.asarray(factor.view)[:n])
+        epoch = views[-1] % len(scene.recording.time)
+        keys.append(np.stack([group, epoch, entity], axis=1))
         pad = [(0, 0), (0, components - r.shape[1])]
         residuals.append(np.pad(np.asarray(r)[:n], pad))
         for parts, own in ((halves, half), (tangents, tangent)):
@@ -128,7 +130,7 @@ def arrange(adjustment: Adjustment) -> Arrangement:
     return Arrangement(
         cells,
         rows,
-        distinct[:, 1],
+        np.concatenate(views)[rows.min(axis=1)],
         np.concatenate(drivers),
         tuple(starts),
         components,

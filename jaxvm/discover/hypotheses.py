@@ -20,7 +20,7 @@ from jaxvm.network.scene import Scene
 from jaxvm.physics.catalogue import CATALOGUE, Entry, entries_for
 from jaxvm.physics.catalogue.entry import each_mark
 from jaxvm.physics.catalogue.maps import fine_image_map, image_map, plate_map
-from jaxvm.physics.drivers import channel_kind
+from jaxvm.physics.drivers import OWN_BODY, OWN_POWER_ON, channel_kind
 from jaxvm.physics.effects import Effect, Scope, Term
 from jaxvm.physics.forms import FORMS
 from jaxvm.physics.ports import PORTS
@@ -58,7 +58,17 @@ _TWICE = {("target.point_z", "target_x", "square"), ("target.point_z", "target_y
 
 _PATTERNED_PORTS = ("detect.u", "detect.v", "sensor.focal", "target.point_z")
 
-NAMED_ONLY = ("turning", "square", "ageing", "staircase", "two decays", "direction")
+NAMED_ONLY = (
+    "affine",
+    "affine lag",
+    "parabola",
+    "turning",
+    "square",
+    "ageing",
+    "staircase",
+    "two decays",
+    "direction",
+)
 """Forms that are asked only where the catalogue names them."""
 
 FREE = 8
@@ -272,7 +282,7 @@ def _variants(entry: Entry, group: Group) -> int:
 
 def _driver_kinds(kind: str, driver: str, scope: Scope) -> tuple[str, ...]:
     """Kinds of a driver for the bodies of a scope, general ones first."""
-    if kind not in ("quantity", "difference"):
+    if kind not in ("quantity", "difference", "own"):
         return (kind,)
     own = channel_kind(driver)
     body = driver.split(" - ")[0].removeprefix("body_").removesuffix("_degC")
@@ -282,7 +292,9 @@ def _driver_kinds(kind: str, driver: str, scope: Scope) -> tuple[str, ...]:
 
 
 def driver_kind(scene: Scene, driver: str) -> str:
-    """Kind of a time-like driver: "constant", "quantity", "difference", "time" or "power-on"."""
+    """Kind of a time-like driver: "constant", "quantity", "difference", "own", "time" or
+    "power-on".
+    """
     channels = scene.network.channels
     kind = channels.kinds[channels.index(driver)]
     return "time" if kind == "order" else kind
@@ -317,6 +329,8 @@ def _family(scene: Scene, groups, courses, scopes, named: dict[str, int]) -> Fam
                     continue
                 valid[g, c, s] = kinds[s] == group.entity
                 valid[g, c, s] &= not group.target or scope.target == (group.target,)
+                if course.driver in (OWN_BODY, OWN_POWER_ON):
+                    valid[g, c, s] &= len(scope.camera) > 1
                 if course.driver.startswith("time since power-on of "):
                     camera = course.driver.removeprefix("time since power-on of ")
                     valid[g, c, s] &= scope.camera == (camera,)
@@ -362,7 +376,7 @@ def _as_named(scene: Scene, groups: list[Group], courses: list[Course], listed: 
                 for e in entries
             )
         )
-        for n in (1, 2):
+        for n in (1, 2, 3):
             of_size = tuple(k for k in own if len(FORMS[courses[k].form].bases) == n)
             if of_size:
                 together.setdefault((len(group.terms), of_size), []).append(group)
@@ -463,8 +477,24 @@ def _courses(scene: Scene) -> list[Course]:
                     for share in (0.1, 0.2, 0.3)
                 ),
             ]
+        elif kind == "own":
+            width = float(np.ptp(np.asarray(channels.values[channels.index(name)])))
+            courses += [
+                Course(name, form, (), reference)
+                for form in ("linear", "affine", "quadratic", "parabola")
+            ]
+            courses += [
+                Course(name, form, (float(tau),), reference)
+                for form in ("lag", "affine lag")
+                for tau in lags
+            ]
+            courses += [
+                Course(name, "hysteresis", (float(share * width),), reference)
+                for share in (0.1, 0.2, 0.3)
+                if width > 0.0
+            ]
         elif kind == "difference":
-            courses.append(Course(name, "linear", (), reference))
+            courses += [Course(name, form, (), reference) for form in ("linear", "affine")]
             courses += [Course(name, "lag", (float(tau),), reference) for tau in lags[1::2]]
         elif kind in ("time", "power-on"):
             since = time - time[0] if kind == "time" else np.interp(

@@ -193,8 +193,8 @@ def _at(families: tuple[Family, ...], effect: Effect) -> tuple[Family, ...]:
             for place, course in enumerate(family.courses)
             if (course.driver, course.form) == (effect.driver, effect.form)
         ]
-        if own:
-            first = own[0]
+        first = own[0] if own else 0
+        if own and family.valid[:, first].any():
             course = Course(effect.driver, effect.form, effect.constants, effect.reference)
             found.append(
                 replace(

@@ -136,7 +136,7 @@ def battery(scene: Scene, arrangement: Arrangement, families: tuple[Family, ...]
     for family, course in zip(families, course_tables(scene, families), strict=True):
         used.append(np.flatnonzero(family.valid.any(axis=0).ravel()))
         c, s = np.divmod(used[-1], len(family.scopes))
-        weights.append(course[:, :, arrangement.epoch][c] * inside[s][:, None])
+        weights.append(course[:, :, arrangement.view][c] * inside[s][:, None])
     return Battery(families, tuple(weights), tuple(used))
 
 
@@ -240,25 +240,26 @@ def _inside(scene: Scene, arrangement: Arrangement, scopes: tuple[Scope, ...]) -
 
 
 def course_tables(scene: Scene, families: tuple[Family, ...]) -> list[np.ndarray]:
-    """Courses [courses, bases, epochs] of each family, at the epochs."""
+    """Courses [courses, bases, views] of each family."""
     channels = scene.network.channels
     place: dict[tuple, int] = {}
-    x, basis, constants, index = [], [], [], []
+    columns, index = [], []
     for family in families:
-        own = []
+        of_family = []
         for course in family.courses:
             form = FORMS[course.form]
             reference = course.reference if form.centred else 0.0
             for name in form.bases:
                 key = (course.driver, reference, name, course.constants)
                 if key not in place:
-                    place[key] = len(x)
-                    x.append(np.asarray(channels.values[channels.index(course.driver)]) - reference)
-                    basis.append(BASIS_INDEX[name])
-                    constants.append((*course.constants, 1.0, 1.0)[:2])
-                own.append(place[key])
-        index.append(np.array(own).reshape(len(family.courses), family.n_bases))
-    table = evaluate((np.array(basis), np.array(x), np.array(constants)), channels)
+                    place[key] = len(columns)
+                    own = (*course.constants, 1.0, 1.0)[:2]
+                    channel = channels.index(course.driver)
+                    columns.append((BASIS_INDEX[name], channel, reference, own))
+                of_family.append(place[key])
+        index.append(np.array(of_family).reshape(len(family.courses), family.n_bases))
+    basis, channel, reference, constants = map(np.array, zip(*columns, strict=True))
+    table = evaluate(basis, channel, reference, constants, channels)
     return [np.asarray(table)[own] for own in index]
 
 

@@ -39,7 +39,7 @@ def bind(scene: Scene) -> Scene:
         pixels.append(eqx.tree_at(lambda f: f.pattern, factor, jnp.asarray(patterns)))
     network = eqx.tree_at(lambda n: n.pixels, network, tuple(pixels))
     if network.ranges is not None:
-        patterns = np.zeros((len(network.ranges.epoch), n_columns))
+        patterns = np.zeros((len(network.ranges.view), n_columns))
         if scene.effects:
             drivers = range_driver_table(scene, network.ranges)
             inside = [ranges_in_scope(scene, effect.scope) for effect in scene.effects]

@@ -75,7 +75,7 @@ class PixelFactor(Factor):
     sigma: Float[Array, "observations 2"]
     weight: Float[Array, " observations"]
     circumstances: Circumstances
-    epoch: Int[Array, " observations"]
+    view: Int[Array, " observations"]
     pattern: Float[Array, "observations columns"]
 
     @property
@@ -105,7 +105,7 @@ class RangeFactor(Factor):
     circumstances: Circumstances
     to_plane: Float[Array, " observations"]
     measured: Float[Array, " observations"]
-    epoch: Int[Array, " observations"]
+    view: Int[Array, " observations"]
     pattern: Float[Array, "observations columns"]
 
     def bare(self):

@@ -98,7 +98,7 @@ def rows(
     factor: Factor,
     network: Network,
     flat: Float[Array, " n"],
-    values: Float[Array, "columns epochs"],
+    values: Float[Array, "columns views"],
 ) -> Float[Array, "observations components"]:
     """Predicted minus measured of one table, in its unit."""
     return _chained(_values, factor, flat, _ports(factor, _acting(network, flat, values)))
@@ -124,11 +124,11 @@ class Acting(NamedTuple):
 
     amplitude: Float[Array, " columns"]
     ports: Float[Array, "columns ports"]
-    value: Float[Array, "columns epochs"]
+    value: Float[Array, "columns views"]
 
 
 def _acting(network: Network, flat, values) -> Acting:
-    """With spare epochs, so that a recording of another length is no other program."""
+    """With spare views, so that a recording of another length is no other program."""
     (flat,) = hosted(flat)
     amplitude = flat[network.layout.all("amplitude")]
     return Acting(amplitude, network.effects.ports, roomy(values, axis=1))
@@ -151,13 +151,13 @@ def _ports(factor: Factor, acting: Acting) -> Float[Array, "observations ports"]
     """Port values of each observation: what all effects together do to it; None without effects."""
     if not (isinstance(factor, PixelFactor | RangeFactor) and len(acting.amplitude)):
         return None
-    return by_blocks(_port_values, (factor.epoch, factor.pattern), acting)
+    return by_blocks(_port_values, (factor.view, factor.pattern), acting)
 
 
 @jax.jit
 def _port_values(table, acting: Acting):
-    epoch, pattern = table
-    return (acting.amplitude * acting.value.T[epoch] * pattern) @ acting.ports
+    view, pattern = table
+    return (acting.amplitude * acting.value.T[view] * pattern) @ acting.ports
 
 
 class Linearised(NamedTuple):
@@ -172,8 +172,8 @@ def linearise(
     factor: Factor,
     network: Network,
     flat: Float[Array, " n"],
-    values: Float[Array, "columns epochs"],
-    slopes: Float[Array, "columns epochs 2"],
+    values: Float[Array, "columns views"],
+    slopes: Float[Array, "columns views 2"],
     live: tuple[int, ...],
     tangent: bool = False,
 ) -> Linearised:
@@ -198,7 +198,7 @@ def linearise(
     else:
         assert isinstance(factor, PixelFactor | RangeFactor)
         owner = _owners(network.effects, len(layout.all("constant")))
-        table = (by_ports, factor.epoch, factor.pattern)
+        table = (by_ports, factor.view, factor.pattern)
         by_effects = by_blocks(_by_effects, table, acting, roomy(slopes, axis=1), owner)
         by_effects = by_effects[:, :, np.asarray(wanted)]
     joined: Any = np if isinstance(by_own, np.ndarray) else jnp
@@ -214,11 +214,11 @@ def _owners(effects: EffectTable, n: int) -> Float[Array, "columns 2 constants"]
 @jax.jit
 def _by_effects(table, acting: Acting, slopes, owner):
     """Derivatives of rows by all amplitudes, then by all constants of effects."""
-    by_ports, epoch, pattern = table
+    by_ports, view, pattern = table
     n, components, _ = by_ports.shape
     entering = (by_ports @ acting.ports.T) * pattern[:, None, :]
-    by_amplitudes = entering * acting.value.T[epoch][:, None, :]
-    slope = jnp.moveaxis(slopes, 1, 0)[epoch]
+    by_amplitudes = entering * acting.value.T[view][:, None, :]
+    slope = jnp.moveaxis(slopes, 1, 0)[view]
     moved = (entering * acting.amplitude)[..., None] * slope[:, None]
     by_constants = jnp.reshape(moved, (n, components, -1)) @ jnp.reshape(
         owner, (-1, owner.shape[2])

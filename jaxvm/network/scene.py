@@ -118,6 +118,7 @@ def build(recording: Recording, effects: tuple[Effect, ...] | None = None) -> Sc
         {c.name: c.powered_on_s for c in model.cameras if c.powered_on_s},
         recording.timed,
         recording.time[list(recording.starts)],
+        tuple(camera.name for camera in model.cameras),
     )
     empty, _, _ = tabulate((), channels, 0, 1)
     nothing = np.zeros(0, int)

@@ -32,6 +32,7 @@ class Tables:
         self.recording = scene.recording
         self.model = scene.model
         self.layout = scene.network.layout
+        self.channels = scene.network.channels
         self.station_row = scene.station_row
         self.target_row = scene.target_row
         self.first_point = scene.first_point
@@ -117,7 +118,7 @@ class Tables:
                     circumstances=self.circumstances(
                         epoch, target, point, obs.pixel[chosen], height, self.along_beam[camera]
                     ),
-                    epoch=jnp.asarray(epoch),
+                    view=jnp.asarray(self.channels.view(camera, epoch)),
                     pattern=jnp.zeros((len(chosen), 0)),
                 )
             )
@@ -146,7 +147,7 @@ class Tables:
             ),
             to_plane=jnp.asarray(to_plane, float),
             measured=jnp.asarray(ranges.distance),
-            epoch=jnp.asarray(ranges.epoch),
+            view=jnp.asarray(self.channels.view(0, ranges.epoch)),
             pattern=jnp.zeros((n, 0)),
         )
 

@@ -62,6 +62,9 @@ PLANES: dict[str, tuple[str, str, float]] = {
 }
 """Two observation-like drivers together, and the spacing of the tiles of a map over them."""
 
+OWN_BODY, OWN_POWER_ON = "own_body_degC", "time since own power-on"
+"""Drivers that each camera has for itself."""
+
 OBSERVATION_DRIVER_INDEX = {name: i for i, name in enumerate(OBSERVATION_DRIVERS)}
 
 
@@ -232,13 +235,16 @@ def build_channels(
     power_on: dict[str, tuple[float, ...]],
     timed: bool = True,
     starts: Float[np.ndarray, " sessions"] | None = None,
+    cameras: tuple[str, ...] = (),
 ) -> Channels:
     """Channels of a recording: its own, time (s since the first epoch), time since power-on.
 
     `power_on` maps a camera to its moments of power-on on the recording's clock (s). Where only the
     order of the epochs is known (not `timed`), there is "order" in place of "time". What is warmer
     than the air bends: the difference of each temperature against the ambient one is a channel,
-    too. Where there are several sessions (`starts`, s), the time since the start of each is one.
+    too, and so is the temperature of each camera's own body, and the time since its own power-on,
+    where all `cameras` have one. Where there are several sessions (`starts`, s), the time since the
+    start of each is one.
     """
     grid = epoch_time if recorded_time is None else recorded_time
     moments = {name: np.asarray(own, float) for name, own in power_on.items()}
@@ -264,10 +270,23 @@ def build_channels(
         f"time since power-on of {camera}": ("power-on", _since(grid, own))
         for camera, own in moments.items()
     }
+    names = list(rows)
+    reads = {name: (place,) * max(len(cameras), 1) for place, name in enumerate(names)}
+    for name, kind, of_camera in (
+        (OWN_BODY, "own", "body_{}_degC"),
+        (OWN_POWER_ON, "power-on", "time since power-on of {}"),
+    ):
+        each = [of_camera.format(camera) for camera in cameras]
+        if len(each) > 1 and all(own in rows for own in each):
+            rows[name] = kind, np.mean([rows[own][1] for own in each], axis=0)
+            reads[name] = tuple(names.index(own) for own in each)
+    if len(rows) == len(names):
+        reads = {name: own[:1] for name, own in reads.items()}
     return Channels(
         time=jnp.asarray(grid, float),
         values=jnp.asarray(np.stack([values for _, values in rows.values()]), float),
         epoch_time=jnp.asarray(epoch_time, float),
+        reads=jnp.asarray(list(reads.values())),
         names=tuple(rows),
         kinds=tuple(kind for kind, _ in rows.values()),
     )

@@ -123,22 +123,31 @@ class Effect:
 
 
 class Channels(eqx.Module):
-    """Time-like drivers on one common grid of times, and how epochs read them.
+    """Time-like drivers on one common grid of times, and how the views of epochs read them.
+
+    Some drivers differ between cameras: each follows the temperature of its own body. Where there
+    are such, an epoch has one *view* for each camera (number camera x epochs + epoch), else one.
 
     Attributes:
         names: channel names; the first is "constant" (all ones).
         time: grid (s).
         values: one row a channel.
         epoch_time: time of each epoch (s).
-        kinds: for each channel "constant", "quantity", "difference" (of two temperatures), "time",
-            "order" or "power-on".
+        reads: row of values that each view reads for a channel [channels, views of an epoch].
+        kinds: for each channel "constant", "quantity", "difference" (of two temperatures), "own"
+            (each camera's), "time", "order" or "power-on".
     """
 
     time: Float[Array, " times"]
     values: Float[Array, "channels times"]
     epoch_time: Float[Array, " epochs"]
+    reads: Int[Array, "channels cameras"]
     names: tuple[str, ...] = eqx.field(static=True)
     kinds: tuple[str, ...] = eqx.field(static=True)
+
+    def view(self, camera, epoch):
+        """Number of the view of an epoch by a camera."""
+        return epoch + (camera * len(self.epoch_time) if self.reads.shape[1] > 1 else 0)
 
     def index(self, name: str) -> int:
         """Row of a channel; KeyError with the known names otherwise."""
@@ -225,38 +234,66 @@ def room_for(effects: tuple[Effect, ...], present: tuple[int, int]) -> tuple[int
 
 def courses(
     table: EffectTable, constants: Float[Array, " constants"], channels: Channels
-) -> Float[Array, "columns epochs"]:
-    """Course of every column at the epochs. Differentiable in the constants."""
-    return evaluate(_as_rows(table, constants, channels), channels)
+) -> Float[Array, "columns views"]:
+    """Course of every column at the views. Differentiable in the constants."""
+    return _in_views(_at_epochs, *_columns(table, constants), channels)
 
 
 def course_slopes(
     table: EffectTable, constants: Float[Array, " constants"], channels: Channels
-) -> Float[Array, "columns epochs 2"]:
+) -> Float[Array, "columns views 2"]:
     """Derivative of every column's course with respect to its own two constants."""
-    return _by_kinds(_slopes, _as_rows(table, constants, channels), channels)
+    return _in_views(_slopes, *_columns(table, constants), channels)
 
 
 _FEW = 16
 """Courses that are evaluated at once."""
 
 
-def _as_rows(table: EffectTable, constants, channels: Channels):
-    """Basis, driver and constants of each column."""
-    values, channel, reference = hosted(channels.values, table.channel, table.reference)
+def _columns(table: EffectTable, constants) -> tuple[Any, Any, Any, Any]:
+    """Basis, channel, reference and constants of each column."""
     constants, index = hosted(constants, table.constant_index)
-    return table.basis, values[channel] - reference[:, None], constants[index]
+    channel, reference = hosted(table.channel, table.reference)
+    return table.basis, channel, reference, constants[index]
 
 
-def evaluate(rows, channels: Channels) -> Float[Array, "n epochs"]:
-    """Courses of many bases at the epochs.
+def evaluate(basis, channel, reference, constants, channels: Channels) -> Float[Array, "n views"]:
+    """Courses of many bases at the views.
 
     Args:
-        rows: for each its number [n], its driver over the grid of times [n, times], and its
-            constants [n, 2].
-        channels: the grid of times, and the epochs.
+        basis, channel: for each its number [n].
+        reference: from which its driver counts [n].
+        constants: its constants [n, 2].
+        channels: the drivers, and the epochs.
     """
-    return _by_kinds(_at_epochs, rows, channels)
+    return _in_views(_at_epochs, basis, channel, reference, constants, channels)
+
+
+def _in_views(function, basis, channel, reference, constants, channels: Channels) -> Any:
+    """A function of courses at the epochs, for the views of one camera after the other."""
+    together = whole(basis, channel, reference, constants, channels.values)
+    values, reads = channels.values, channels.reads
+    if not together:
+        values, reads = hosted(values, reads)
+
+    def of(camera: int, chosen: Any = slice(None)):
+        x = values[reads[channel, camera]] - reference[:, None]
+        return _by_kinds(function, (basis[chosen], x[chosen], constants[chosen]), channels)
+
+    found = [of(0)]
+    for camera in range(1, reads.shape[1]):
+        if together:
+            found.append(of(camera))
+            continue
+        # Most drivers are the same for all cameras.
+        changed = np.flatnonzero(reads[channel, camera] != reads[channel, 0])
+        own = found[0]
+        if len(changed):
+            own = np.array(own)
+            own[changed] = of(camera, changed)
+        found.append(own)
+    joined: Any = np if isinstance(found[0], np.ndarray) else jnp
+    return found[0] if len(found) == 1 else joined.concatenate(found, axis=1)
 
 
 def _by_kinds(function, rows, channels: Channels) -> Any:

@@ -172,6 +172,26 @@ FORMS: dict[str, Form] = {
     for form in (
         Form("constant", ("one",), (), "always the same"),
         Form("linear", ("linear",), (), "in proportion to {driver}", centred=True),
+        Form(
+            "affine",
+            ("one", "linear"),
+            (),
+            "in proportion to {driver}, from a reference of its own",
+        ),
+        Form(
+            "affine lag",
+            ("one", "lag"),
+            (_TAU,),
+            "following {driver} with a lag, from a reference of its own",
+            centred=True,
+        ),
+        Form(
+            "parabola",
+            ("one", "linear", "square"),
+            (),
+            "as a parabola of {driver}, from a reference of its own",
+            centred=True,
+        ),
         Form("quadratic", ("linear", "square"), (), "as a parabola of {driver}", centred=True),
         Form("lag", ("lag",), (_TAU,), "following {driver} with a lag", centred=True),
         Form(

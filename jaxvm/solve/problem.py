@@ -217,7 +217,7 @@ def _assembled(
         common = place[0, k:]
         place, member = place[:, :k], member[:, :k]
         jacobian, value = table.jacobian * root[:, :, None], r * root
-        beside = jnp.reshape(jacobian[:, :, k:], (-1, common.shape[0]))
+        beside = jnp.reshape(jacobian[:, :, k:], (r.size, common.shape[0]))
         apart, product = packet_products(packets, jacobian[:, :, :k], jacobian, value)
         own, cross = apart[:, :, :k], apart[:, :, k:]
         gradient = gradient.at[packets.columns[:, :k]].add(product)

@@ -43,7 +43,7 @@ class Entry:
     explanation: str
 
 
-THERMAL = ("linear", "lag", "two lags")
+THERMAL = ("linear", "lag", "two lags", "affine", "affine lag")
 """Forms of what follows a quantity, at once or late."""
 
 SETTLING = ("linear", "proportional", "onset", "creep", "ramp", "settling")

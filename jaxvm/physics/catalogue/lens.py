@@ -57,7 +57,7 @@ LENS: tuple[Entry, ...] = (
     Entry(
         "focal-quadratic", "the focal length drifts out of proportion to the temperature",
         (39, 80),
-        _FOCAL, ("temperature",), ("quadratic",), "camera",
+        _FOCAL, ("temperature",), ("quadratic", "parabola"), "camera",
         (5e-7, 1e-3), "a thermal drift with a lag", "a wide range of temperature",
         "Lens and body expand, and the glass changes its index, not quite in proportion to the "
         "temperature. Over a wide range the drift of the principal distance is a parabola.",
