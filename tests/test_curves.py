@@ -100,6 +100,15 @@ def test_tiles_of_a_plate_sum_to_one_inside():
     assert (whole > (5 / 6) ** 2 - 1e-12).all() and (whole < 1 + 1e-12).all()
 
 
+@pytest.mark.parametrize("finer", [fine_image_map, finest_image_map, fine_plate_map])
+def test_finer_maps_cover_all_of_their_plane(finer):
+    reach = [[1.0], [1.0]] if finer is fine_plate_map else [[0.8], [0.6]]
+    at = np.random.default_rng(2).uniform(-1.0, 1.0, (2, 200)) * reach
+    for port in {term.port for term in finer()}:
+        total = sum_of_tiles([term for term in finer() if term.port == port], *at)
+        assert (total > (5 / 6) ** 2 - 1e-12).all() and (total < 1 + 1e-12).all()
+
+
 def test_a_tile_is_nothing_where_its_plane_has_no_meaning():
     assert (sum_of_tiles(plate_map(), np.full(3, np.nan), np.zeros(3)) == 0.0).all()
 

@@ -1,0 +1,117 @@
+"""Scores of hypotheses against dense projections, and their distribution under noise."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from networks import dense_residuals, stereo_recording
+from test_steps import dense
+
+from jaxvm.discover.cells import arrange
+from jaxvm.discover.hypotheses import enumerate_hypotheses, member
+from jaxvm.discover.noise import multipliers
+from jaxvm.discover.score import battery, score_residuals, surprise
+from jaxvm.network.residual import residual
+from jaxvm.physics.drivers import OWN_BODY
+from jaxvm.physics.effects import Effect, Scope, Term
+from jaxvm.recording.recording import Drivers
+from jaxvm.solve.adjust import adjust
+from jaxvm.solve.problem import scene_problem
+
+
+@pytest.fixture(scope="module")
+def stereo():
+    """A stereo pair, adjusted, with a temperature of the air and of each camera's body."""
+    known = stereo_recording()
+    time = known.recording.time
+    rng = np.random.default_rng(4)
+    names = ("ambient_degC", "body_left_degC", "body_right_degC")
+    channels = {name: 20.0 + np.cumsum(rng.normal(size=len(time))) for name in names}
+    recording = replace(known.recording, drivers=Drivers(time, channels))
+    return adjust(known.true_scene(recording))
+
+
+@pytest.fixture(scope="module")
+def ranked(stereo):
+    scene, arrangement = stereo.scene, arrange(stereo)
+    asked = battery(scene, arrangement, enumerate_hypotheses(scene))
+    still = np.zeros((len(scene.recording.time), 1))
+    return score_residuals(scene, arrangement, asked, 1.0, still)
+
+
+def observed(scene, effects) -> np.ndarray:
+    """Whitened residuals of pixels and ranges with effects in the model."""
+    changed = scene.with_effects(effects)
+    blocks = residual(changed.state, changed.network)
+    return dense_residuals(blocks._replace(priors=None))
+
+
+def test_drops_are_those_of_dense_projections(stereo, ranked):
+    scene = stereo.scene
+    problem = scene_problem(scene)
+    r, j = map(np.asarray, dense(jnp.zeros(problem.n), problem))
+    r, j = (part[: len(observed(scene, ()))] for part in (r, j))
+    base = np.linalg.svd(j, full_matrices=False)
+    base = base[0][:, base[1] > 1e-10 * base[1][0]]
+    rng, compared = np.random.default_rng(0), set()
+    for scores in ranked.scores:
+        found = np.argwhere(scores.valid & (scores.seen > 1e-3))
+        for g, c, s in found[rng.permutation(len(found))[:3]]:
+            hypothesis = member(scores.family, (g, c, s), scene)
+            if hypothesis.group.mark is not None or scores.amplitude.shape[-1] > 8:
+                continue
+            sizes = 1e-2 * np.abs(scores.amplitude[g, c, s]) + 1e-12
+            columns = []
+            for k, size in enumerate(sizes):
+                step = np.zeros(len(sizes))
+                step[k] = size
+                ahead, behind = (observed(scene, (hypothesis.effect(a),)) for a in (step, -step))
+                columns.append((ahead - behind) / (2.0 * size))
+            tangent = np.stack(columns, axis=1)
+            size = np.linalg.norm(tangent, axis=0)
+            if not size.all():
+                continue
+            tangent = (tangent - base @ (base.T @ tangent)) / size
+            if np.linalg.cond(tangent) > 50.0:  # what is nearly alike is cut off softly
+                continue
+            left = r - base @ (base.T @ r)
+            explained = tangent @ np.linalg.lstsq(tangent, left, rcond=1e-10)[0]
+            expected = float(explained @ explained)
+            assert scores.drop[g, c, s] == pytest.approx(expected, rel=1e-3, abs=1e-4), hypothesis
+            compared.add(hypothesis.course.driver)
+    assert {"constant", "time", "ambient_degC", OWN_BODY} <= compared
+
+
+def test_own_temperatures_are_those_of_the_cameras(stereo):
+    """One effect of all cameras with their own temperatures is the sum of one for each."""
+    scene = stereo.scene
+    focal, size = (Term("sensor.focal"),), (1e-3,)
+
+    def drift(driver, *cameras, form="lag", constants=(100.0,)):
+        return Effect("", focal, driver, form, constants, 20.0, Scope(camera=cameras), size)
+
+    together = observed(scene, (drift(OWN_BODY, "left", "right"),))
+    apart = observed(scene, (drift("body_left_degC", "left"), drift("body_right_degC", "right")))
+    assert np.abs(together - observed(scene, ())).max() > 0.1
+    np.testing.assert_allclose(together, apart, rtol=0, atol=1e-10)
+
+
+def test_white_noise_inflates_nothing(stereo):
+    scene, arrangement = stereo.scene, arrange(stereo)
+    asked = battery(scene, arrangement, enumerate_hypotheses(scene))
+    signs = multipliers(len(scene.recording.time), 1, 99, 0)
+    found = score_residuals(scene, arrangement, asked, 1.0, signs, studentised=True)
+    inflation = np.concatenate([s.inflation[s.valid] for s in found.scores])
+    assert np.median(inflation) < 2.0
+    # No hypothesis is beyond what the multipliers give: the data are the model and noise.
+    assert found.p_value(found.best_z()) > 0.01
+
+
+def test_a_surprise_is_the_log_of_a_tail():
+    from scipy.stats import chi2
+
+    for columns in (1, 2, 6, 40):
+        for statistic in (columns + 30.0, columns + 200.0):
+            told = surprise(np.array(statistic), columns)
+            assert told == pytest.approx(-2.0 * chi2.logsf(statistic, columns), rel=0.2)
