@@ -2,7 +2,9 @@
 
 import argparse
 import json
+import signal
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -17,8 +19,10 @@ INTERRUPTED = 130
 def main(arguments: list[str] | None = None) -> int:
     """Run a command; returns the exit status (0 done, 2 bad input, 130 interrupted)."""
     options = _parser().parse_args(arguments)
+    options.interruption = Interruption()
     try:
-        answer, text = options.run(options)
+        with options.interruption:
+            answer, text = options.run(options)
     except KeyboardInterrupt:
         print("interrupted; nothing was left half-written", file=sys.stderr)
         return INTERRUPTED
@@ -28,6 +32,36 @@ def main(arguments: list[str] | None = None) -> int:
         return BAD_INPUT
     print(json.dumps(answer, indent=1, allow_nan=False) if options.json else text)
     return 0
+
+
+class Interruption:
+    """Ctrl-C, remembered: what arrives in a library's callback is lost there, but not here."""
+
+    def __init__(self) -> None:
+        self.asked = False
+        self._former: Any = None
+
+    def __enter__(self) -> "Interruption":
+        if threading.current_thread() is threading.main_thread():
+            self._former = signal.signal(signal.SIGINT, self._stop)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._former is not None:
+            signal.signal(signal.SIGINT, self._former)
+
+    def _stop(self, *_: object) -> None:
+        self.asked = True
+        raise KeyboardInterrupt
+
+    def check(self) -> None:
+        """Stop now if somebody asked for it before.
+
+        Raises:
+            KeyboardInterrupt: somebody did.
+        """
+        if self.asked:
+            raise KeyboardInterrupt
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -150,6 +184,7 @@ def _progress(options) -> Callable[[str], None]:
     began = time.perf_counter()
 
     def line(text: str) -> None:
+        options.interruption.check()
         if not options.quiet:
             print(f"{time.perf_counter() - began:6.1f} s  {text}", file=sys.stderr, flush=True)
 
@@ -223,6 +258,7 @@ def _diagnose_one(options, name: str, out: Path):
     found = diagnose(
         recording, every=options.every, alpha=options.alpha, seed=options.seed, progress=progress
     )
+    progress("writing the report")
     return _report(found, out, options.data_only)
 
 

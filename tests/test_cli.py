@@ -12,7 +12,7 @@ import pytest
 from networks import board_recording
 
 import jaxvm.cli
-from jaxvm.cli import main
+from jaxvm.cli import Interruption, main
 from jaxvm.recording import read_recording, write_recording
 from jaxvm.simulate import HIDEABLE
 
@@ -107,6 +107,19 @@ def test_simulate_writes_a_valid_recording(tmp_path, capsys):
     assert not [key for key in HIDEABLE if key in text] and "slip" not in text
     assert main([*arguments, "--out", str(folder)]) == 2
     assert "already there" in capsys.readouterr().err
+
+
+def test_an_interrupt_that_a_callback_swallowed_is_not_lost():
+    before = signal.getsignal(signal.SIGINT)
+    with Interruption() as interruption:
+        interruption.check()
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            pass  # as a library does
+        with pytest.raises(KeyboardInterrupt):
+            interruption.check()
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_interrupted_run_leaves_nothing(board, tmp_path):
