@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from networks import matrix, stereo_recording, to_plane, to_point
 
-from jaxvm.discover.hypotheses import Hypothesis, driver_kind, enumerate_hypotheses, member
+from jaxvm.discover.courses import driver_kind
+from jaxvm.discover.hypotheses import Hypothesis, enumerate_hypotheses, member
 from jaxvm.network.binding import in_scope, range_driver_table
 from jaxvm.network.residual import residual
 from jaxvm.network.scene import Scene, build

@@ -5,22 +5,24 @@ A *group* is what enters where (terms), a *course* how it runs in time (driver, 
 the shapes of their products when they are scored.
 """
 
-import math
 from collections import Counter
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from jaxvm.discover.curves import (
-    CURVED,
-    CURVED_FAST,
-    curved_drivers,
+from jaxvm.discover.courses import (
+    Course,
+    courses_of_marks,
+    driver_kind,
+    enumerate_courses,
+    kinds_in_scope,
 )
+from jaxvm.discover.curves import CURVED, CURVED_FAST, curved_drivers
 from jaxvm.network.scene import Scene
 from jaxvm.physics.catalogue import CATALOGUE, Entry, entries_for
 from jaxvm.physics.catalogue.entry import each_mark
 from jaxvm.physics.catalogue.maps import fine_image_map, image_map, plate_map
-from jaxvm.physics.drivers import OWN_BODY, OWN_POWER_ON, channel_kind
+from jaxvm.physics.drivers import OWN_BODY, OWN_POWER_ON
 from jaxvm.physics.effects import Effect, Scope, Term
 from jaxvm.physics.forms import FORMS
 from jaxvm.physics.ports import PORTS
@@ -74,9 +76,6 @@ NAMED_ONLY = (
 FREE = 8
 """A hypothesis with more columns than this is a free form: a curve or a map."""
 
-_MOST_OF_MARKS = 3000
-"""Hypotheses about single marks; where marks and instants are many, fewer instants are asked."""
-
 
 @dataclass(frozen=True)
 class Group:
@@ -88,16 +87,6 @@ class Group:
     """(target, point) when a single mark is meant."""
     target: str = ""
     """The only target that can have it, where the terms name its marks."""
-
-
-@dataclass(frozen=True)
-class Course:
-    """A time-like driver in a form with given constants."""
-
-    driver: str
-    form: str
-    constants: tuple[float, ...] = ()
-    reference: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -209,7 +198,7 @@ def describe(hypothesis: Hypothesis) -> str:
 def enumerate_hypotheses(scene: Scene) -> tuple[Family, ...]:
     """All hypotheses that a recording can be asked about."""
     scopes = _scopes(scene)
-    courses = _courses(scene)
+    courses = enumerate_courses(scene)
     single = [
         Group((Term(port.name),), _entity(port.name))
         for port in PORTS
@@ -243,7 +232,7 @@ def enumerate_hypotheses(scene: Scene) -> tuple[Family, ...]:
         (patterned, constant),
         *((_of_size(moving, size), by_bases[n]) for size in (1, 2, 3) for n in (1, 2)),
         *_as_named(scene, every_named, courses, listed),
-        (marks, _courses_of_marks(courses, len(marks))),
+        (marks, courses_of_marks(courses, len(marks))),
         *_free_forms(scene, constant),
         *_of_each_mark(scene, constant),
     ]
@@ -264,7 +253,7 @@ def member(family: Family, index: tuple[int, int, int], scene: Scene) -> Hypothe
     if group.mark is not None:
         target = scene.model.targets[group.mark[0]]
         scope = Scope(target=(target.name,), point=(target.point_names[group.mark[1]],))
-    kinds = _driver_kinds(family.kinds[index[1]], course.driver, scope)
+    kinds = kinds_in_scope(family.kinds[index[1]], course.driver, scope)
     entries = entries_for(group.terms, group.entity, kinds, course.form)
     each = len(family.groups) if group.mark is not None else 1
     asked = {entry.id: each * family.named[entry.id] * _variants(entry, group) for entry in entries}
@@ -280,30 +269,10 @@ def _variants(entry: Entry, group: Group) -> int:
     return sum(alike == [(t.port, t.driver, t.basis) for t in own] for own in entry.groups) or 1
 
 
-def _driver_kinds(kind: str, driver: str, scope: Scope) -> tuple[str, ...]:
-    """Kinds of a driver for the bodies of a scope, general ones first."""
-    if kind not in ("quantity", "difference", "own"):
-        return (kind,)
-    own = channel_kind(driver)
-    body = driver.split(" - ")[0].removeprefix("body_").removesuffix("_degC")
-    if driver.startswith("body_") and len(scope.camera) == 1 and body not in scope.camera:
-        return ("quantity", own, "neighbour")
-    return ("quantity", own)
-
-
-def driver_kind(scene: Scene, driver: str) -> str:
-    """Kind of a time-like driver: "constant", "quantity", "difference", "own", "time" or
-    "power-on".
-    """
-    channels = scene.network.channels
-    kind = channels.kinds[channels.index(driver)]
-    return "time" if kind == "order" else kind
-
-
 def _asked_of_names(scene: Scene, courses: list[Course]) -> dict[str, int]:
     """Number of drivers and forms in which each entry of the catalogue is asked."""
     distinct = {(course.driver, course.form) for course in courses}
-    kinds = {d: _driver_kinds(driver_kind(scene, d), d, Scope()) for d, _ in distinct}
+    kinds = {d: kinds_in_scope(driver_kind(scene, d), d, Scope()) for d, _ in distinct}
     return {
         entry.id: max(
             sum(
@@ -354,7 +323,7 @@ def _as_named(scene: Scene, groups: list[Group], courses: list[Course], listed: 
     Those that are `listed` are asked with the constant course already.
     """
     kinds = {
-        course.driver: _driver_kinds(driver_kind(scene, course.driver), course.driver, Scope())
+        course.driver: kinds_in_scope(driver_kind(scene, course.driver), course.driver, Scope())
         for course in courses
     }
     # At the ends of a recording a step is a constant, which a map without a name explains.
@@ -431,107 +400,6 @@ def _faces(scene: Scene) -> list[Scope]:
     return found
 
 
-def _courses(scene: Scene) -> list[Course]:
-    channels = scene.network.channels
-    time = np.asarray(channels.epoch_time)
-    courses = [Course("constant", "constant")]
-    if len(time) < 6:
-        return courses
-    span = float(time[-1] - time[0])
-    spacing = float(np.median(np.diff(time)))
-    lags = np.geomspace(max(2 * spacing, span / 200), span / 3, 6)
-    for name, kind in zip(channels.names, channels.kinds, strict=True):
-        reference = channels.mean(name)
-        if kind == "quantity":
-            at_epochs = np.interp(time, channels.time, channels.values[channels.index(name)])
-            width = float(np.ptp(at_epochs))
-            if width == 0.0:
-                continue
-            rates = np.abs(np.gradient(at_epochs, time / 3600.0))
-            courses += [
-                Course(name, "linear", (), reference),
-                Course(name, "quadratic", (), reference),
-                *(Course(name, "lag", (float(tau),), reference) for tau in lags),
-                Course(name, "two lags", (float(lags[1]), float(lags[4])), reference),
-                Course(name, "proportional"),
-                Course(name, "square"),
-                Course(name, "rate"),
-                *(Course(name, "transient", (float(tau),)) for tau in lags[:4]),
-                *(
-                    Course(name, "direction", (float(share * np.median(rates)) + 1e-12, float(tau)))
-                    for share in (0.1, 0.7)
-                    for tau in (0.4 * lags[0], lags[0], lags[2])
-                ),
-                Course(name, "ageing", (), reference),
-                *(
-                    Course(name, "turning", (times * span,), reference)
-                    for times in (4.0, 7.0, 15.0)
-                ),
-                *(
-                    Course(name, "staircase", (float(share * width), phase), reference)
-                    for share in (0.12, 0.17, 0.22, 0.28, 0.36, 0.45)
-                    for phase in (0.0, 0.5)
-                ),
-                *(
-                    Course(name, "hysteresis", (float(share * width),), reference)
-                    for share in (0.1, 0.2, 0.3)
-                ),
-            ]
-        elif kind == "own":
-            width = float(np.ptp(np.asarray(channels.values[channels.index(name)])))
-            courses += [
-                Course(name, form, (), reference)
-                for form in ("linear", "affine", "quadratic", "parabola")
-            ]
-            courses += [
-                Course(name, form, (float(tau),), reference)
-                for form in ("lag", "affine lag")
-                for tau in lags
-            ]
-            courses += [
-                Course(name, "hysteresis", (float(share * width),), reference)
-                for share in (0.1, 0.2, 0.3)
-                if width > 0.0
-            ]
-        elif kind == "difference":
-            courses += [Course(name, form, (), reference) for form in ("linear", "affine")]
-            courses += [Course(name, "lag", (float(tau),), reference) for tau in lags[1::2]]
-        elif kind in ("time", "power-on"):
-            since = time - time[0] if kind == "time" else np.interp(
-                time, channels.time, channels.values[channels.index(name)]
-            )  # fmt: skip
-            courses += [Course(name, "onset", (float(tau),)) for tau in lags]
-            courses += [Course(name, "creep", (float(tau),)) for tau in lags[::2]]
-            if kind == "power-on":
-                courses += [
-                    Course(name, "two decays", (float(lags[k]), float(lags[k + 2])))
-                    for k in (0, 1, 2, 3)
-                ]
-            if kind == "time":
-                courses += [Course(name, "linear", (), reference), Course(name, "proportional")]
-                courses += _courses_of_time(name, since, span, spacing)
-                courses += [
-                    Course(name, "settling", (float(start), float(tau)))
-                    for start in np.linspace(0.1, 0.7, 7) * span
-                    for tau in lags[2::2]
-                ]
-    return courses
-
-
-def _courses_of_time(name: str, since: np.ndarray, span: float, spacing: float) -> list[Course]:
-    """Steps between epochs, ramps, and a comb of periods."""
-    between = 0.5 * (since[1:] + since[:-1])
-    inside = between[2:-2]
-    if len(inside) > 60:
-        inside = inside[np.linspace(0, len(inside) - 1, 60).astype(int)]
-    periods = span / np.arange(1.0, min(span / (2.5 * spacing), 34.0), 0.5)
-    return [
-        *(Course(name, "step", (float(t),)) for t in inside),
-        *(Course(name, "ramp", (float(t),)) for t in np.linspace(0.1, 0.8, 8) * span),
-        *(Course(name, "periodic", (float(period),)) for period in periods),
-    ]
-
-
 def _free_forms(scene: Scene, constant: list[Course]):
     """Curves of ports with time or a quantity, maps over the image and over plates."""
     for form, curved in (("curve", CURVED), ("fine curve", CURVED_FAST)):
@@ -572,14 +440,3 @@ def _marks(scene: Scene) -> list[Group]:
             continue
         groups += [Group(terms, "mark", (t, p)) for p in range(len(target.point_names))]
     return groups
-
-
-def _courses_of_marks(courses: list[Course], n_marks: int) -> list[Course]:
-    """A mark sits wrongly always, from a moment on, ever more slowly, or with temperature."""
-    slow = [
-        [course for course in courses if course.driver == "time" and course.form == form]
-        for form in ("step", "onset", "creep", "settling")
-    ]
-    warm = [c for c in courses if c.form == "linear" and channel_kind(c.driver) == "temperature"]
-    every = math.ceil(max(n_marks * sum(map(len, slow)) / _MOST_OF_MARKS, 1.0))
-    return [courses[0], *warm, *(course for own in slow for course in own[::every])]

@@ -12,7 +12,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from jaxvm.discover.cells import Arrangement
-from jaxvm.discover.hypotheses import Course, Family, Hypothesis, member
+from jaxvm.discover.courses import Course
+from jaxvm.discover.hypotheses import Family, Hypothesis, member
 from jaxvm.discover.score import Battery, Ranking, battery, score_residuals
 from jaxvm.discover.select import DECIDED, log_prior, price_of_columns, stacked
 from jaxvm.physics.effects import Effect

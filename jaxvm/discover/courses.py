@@ -1,0 +1,204 @@
+"""Courses: how an effect may run in time, enumerated for one recording.
+
+A course is a time-like driver in a form. Constants that enter nonlinearly (lags, instants, periods)
+are asked on a grid; a refit refines them.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from jaxvm.network.scene import Scene
+from jaxvm.physics.drivers import channel_kind
+from jaxvm.physics.effects import Channels, Scope
+
+_FEWEST_EPOCHS = 6
+"""A shorter recording is asked only about what does not change."""
+
+_MOST_INSTANTS = 60
+"""Instants at which a step is asked."""
+
+_MOST_OF_MARKS = 3000
+"""Hypotheses about single marks; where marks and instants are many, fewer instants are asked."""
+
+
+@dataclass(frozen=True)
+class Course:
+    """A time-like driver in a form with given constants."""
+
+    driver: str
+    form: str
+    constants: tuple[float, ...] = ()
+    reference: float = 0.0
+
+
+def driver_kind(scene: Scene, driver: str) -> str:
+    """Kind of a time-like driver: "constant", "quantity", "difference", "own", "time" or
+    "power-on".
+    """
+    channels = scene.network.channels
+    kind = channels.kinds[channels.index(driver)]
+    return "time" if kind == "order" else kind
+
+
+def kinds_in_scope(kind: str, driver: str, scope: Scope) -> tuple[str, ...]:
+    """Kinds of a driver for the bodies of a scope, general ones first."""
+    if kind not in ("quantity", "difference", "own"):
+        return (kind,)
+    own = channel_kind(driver)
+    body = driver.split(" - ")[0].removeprefix("body_").removesuffix("_degC")
+    if driver.startswith("body_") and len(scope.camera) == 1 and body not in scope.camera:
+        return ("quantity", own, "neighbour")
+    return ("quantity", own)
+
+
+def enumerate_courses(scene: Scene) -> list[Course]:
+    """All courses that a recording can be asked about; the first is constant."""
+    channels = scene.network.channels
+    courses = [Course("constant", "constant")]
+    if len(channels.epoch_time) < _FEWEST_EPOCHS:
+        return courses
+    span = _span(channels)
+    lags = np.geomspace(max(2 * _spacing(channels), span / 200), span / 3, 6).tolist()
+    for driver, kind in zip(channels.names, channels.kinds, strict=True):
+        if kind in _OF_KIND:
+            courses += _OF_KIND[kind](driver, channels, lags)
+    return courses
+
+
+def courses_of_marks(courses: list[Course], n_marks: int) -> list[Course]:
+    """A mark sits wrongly always, from a moment on, ever more slowly, or with temperature."""
+    slow = [
+        [course for course in courses if course.driver == "time" and course.form == form]
+        for form in ("step", "onset", "creep", "settling")
+    ]
+    warm = [c for c in courses if c.form == "linear" and channel_kind(c.driver) == "temperature"]
+    every = math.ceil(max(n_marks * sum(map(len, slow)) / _MOST_OF_MARKS, 1.0))
+    return [courses[0], *warm, *(course for own in slow for course in own[::every])]
+
+
+def _of_quantity(driver: str, channels: Channels, lags: list[float]) -> list[Course]:
+    """A recorded quantity: followed at once or late, by its rate, or with a memory of its way."""
+    values = np.interp(channels.epoch_time, channels.time, _recorded(driver, channels))
+    width = float(np.ptp(values))
+    if width == 0.0:
+        return []
+    reference, span = channels.mean(driver), _span(channels)
+    hours = np.asarray(channels.epoch_time) / 3600.0
+    rate = float(np.median(np.abs(np.gradient(values, hours))))
+    return [
+        Course(driver, "linear", (), reference),
+        Course(driver, "quadratic", (), reference),
+        *(Course(driver, "lag", (tau,), reference) for tau in lags),
+        Course(driver, "two lags", (lags[1], lags[4]), reference),
+        Course(driver, "proportional"),
+        Course(driver, "square"),
+        Course(driver, "rate"),
+        *(Course(driver, "transient", (tau,)) for tau in lags[:4]),
+        *(
+            Course(driver, "direction", (share * rate + 1e-12, tau))
+            for share in (0.1, 0.7)
+            for tau in (0.4 * lags[0], lags[0], lags[2])
+        ),
+        Course(driver, "ageing", (), reference),
+        *(Course(driver, "turning", (times * span,), reference) for times in (4.0, 7.0, 15.0)),
+        *(
+            Course(driver, "staircase", (share * width, phase), reference)
+            for share in (0.12, 0.17, 0.22, 0.28, 0.36, 0.45)
+            for phase in (0.0, 0.5)
+        ),
+        *_hysteresis(driver, width, reference),
+    ]
+
+
+def _of_own(driver: str, channels: Channels, lags: list[float]) -> list[Course]:
+    """A quantity that each camera has for itself: with a constant, too, as cameras differ."""
+    reference = channels.mean(driver)
+    width = float(np.ptp(_recorded(driver, channels)))
+    forms = ("linear", "affine", "quadratic", "parabola")
+    return [
+        *(Course(driver, form, (), reference) for form in forms),
+        *(
+            Course(driver, form, (tau,), reference)
+            for form in ("lag", "affine lag")
+            for tau in lags
+        ),
+        *(_hysteresis(driver, width, reference) if width > 0.0 else ()),
+    ]
+
+
+def _of_difference(driver: str, channels: Channels, lags: list[float]) -> list[Course]:
+    """A difference of two temperatures: followed at once or late."""
+    reference = channels.mean(driver)
+    return [
+        *(Course(driver, form, (), reference) for form in ("linear", "affine")),
+        *(Course(driver, "lag", (tau,), reference) for tau in lags[1::2]),
+    ]
+
+
+def _of_clock(driver: str, channels: Channels, lags: list[float]) -> list[Course]:
+    """Time since something began: what settles, fast or ever more slowly."""
+    return [
+        *(Course(driver, "onset", (tau,)) for tau in lags),
+        *(Course(driver, "creep", (tau,)) for tau in lags[::2]),
+    ]
+
+
+def _of_power_on(driver: str, channels: Channels, lags: list[float]) -> list[Course]:
+    """Time since a camera was switched on: its parts warm up one after the other."""
+    return [
+        *_of_clock(driver, channels, lags),
+        *(Course(driver, "two decays", pair) for pair in zip(lags, lags[2:], strict=False)),
+    ]
+
+
+def _of_time(driver: str, channels: Channels, lags: list[float]) -> list[Course]:
+    """Time: trends, steps between epochs, ramps, a comb of periods, what settles after an event."""
+    span = _span(channels)
+    time = np.asarray(channels.epoch_time)
+    since = time - time[0]
+    instants = (0.5 * (since[1:] + since[:-1]))[2:-2]
+    if len(instants) > _MOST_INSTANTS:
+        instants = instants[np.linspace(0, len(instants) - 1, _MOST_INSTANTS).astype(int)]
+    periods = span / np.arange(1.0, min(span / (2.5 * _spacing(channels)), 34.0), 0.5)
+    return [
+        *_of_clock(driver, channels, lags),
+        Course(driver, "linear", (), channels.mean(driver)),
+        Course(driver, "proportional"),
+        *(Course(driver, "step", (t,)) for t in instants.tolist()),
+        *(Course(driver, "ramp", (t,)) for t in (np.linspace(0.1, 0.8, 8) * span).tolist()),
+        *(Course(driver, "periodic", (period,)) for period in periods.tolist()),
+        *(
+            Course(driver, "settling", (start, tau))
+            for start in (np.linspace(0.1, 0.7, 7) * span).tolist()
+            for tau in lags[2::2]
+        ),
+    ]
+
+
+_OF_KIND = {
+    "quantity": _of_quantity,
+    "own": _of_own,
+    "difference": _of_difference,
+    "time": _of_time,
+    "power-on": _of_power_on,
+}
+"""Courses of a driver by its kind; the order of images alone drives nothing."""
+
+
+def _hysteresis(driver: str, width: float, reference: float) -> list[Course]:
+    """Play of some shares of the range that a quantity takes."""
+    return [Course(driver, "hysteresis", (share * width,), reference) for share in (0.1, 0.2, 0.3)]
+
+
+def _recorded(driver: str, channels: Channels) -> np.ndarray:
+    return np.asarray(channels.values[channels.index(driver)])
+
+
+def _span(channels: Channels) -> float:
+    return float(channels.epoch_time[-1] - channels.epoch_time[0])
+
+
+def _spacing(channels: Channels) -> float:
+    return float(np.median(np.diff(channels.epoch_time)))
