@@ -11,7 +11,8 @@ from test_steps import dense
 from jaxvm.discover.cells import arrange
 from jaxvm.discover.hypotheses import enumerate_hypotheses, member
 from jaxvm.discover.noise import multipliers
-from jaxvm.discover.score import battery, score_residuals, surprise
+from jaxvm.discover.ranking import surprise
+from jaxvm.discover.score import battery, score_residuals
 from jaxvm.network.residual import residual
 from jaxvm.physics.drivers import OWN_BODY
 from jaxvm.physics.effects import Effect, Scope, Term

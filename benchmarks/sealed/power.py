@@ -22,7 +22,8 @@ from jaxvm.discover.diagnose import ROOM
 from jaxvm.discover.gross import without_gross_errors
 from jaxvm.discover.heldout import Split, hold_out, split
 from jaxvm.discover.hypotheses import enumerate_hypotheses, member
-from jaxvm.discover.score import Battery, Ranking, battery, score_residuals
+from jaxvm.discover.ranking import Ranking
+from jaxvm.discover.score import Battery, battery, score_residuals
 from jaxvm.discover.search import FLIPS
 from jaxvm.network.residual import whitening
 from jaxvm.network.scene import Scene, build

@@ -14,7 +14,8 @@ import numpy as np
 from jaxvm.discover.cells import Arrangement
 from jaxvm.discover.courses import Course
 from jaxvm.discover.hypotheses import Family, Hypothesis, member
-from jaxvm.discover.score import Battery, Ranking, battery, score_residuals
+from jaxvm.discover.ranking import Ranking
+from jaxvm.discover.score import Battery, battery, score_residuals
 from jaxvm.discover.select import DECIDED, log_prior, price_of_columns, stacked
 from jaxvm.physics.effects import Effect
 from jaxvm.solve.adjust import Adjustment

@@ -21,10 +21,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.special import gammaln
 
 from jaxvm.discover.cells import Arrangement, Cells
-from jaxvm.discover.hypotheses import Family, Hypothesis, member
+from jaxvm.discover.hypotheses import Family
+from jaxvm.discover.ranking import Ranking, Scores, surprise
 from jaxvm.network.binding import in_scope, ranges_in_scope
 from jaxvm.network.scene import Scene
 from jaxvm.physics.drivers import pattern
@@ -40,77 +40,6 @@ _MOST_PRODUCTS = 6_000_000
 
 FEWEST_EPOCHS = 3.0
 """A hypothesis that fewer epochs carry than this can't be told from a few bad images."""
-
-
-@dataclass(frozen=True)
-class Scores:
-    """Scores of one family: arrays [groups, courses, scopes].
-
-    Attributes:
-        family: the hypotheses.
-        drop: predicted drop of chi-square (of residuals with unit variance).
-        z: the same as a surprise, about -2 ln p, comparable whatever the number of columns.
-        amplitude: one-step amplitudes [groups, courses, scopes, columns].
-        seen: share of the effect that the model does not absorb.
-        inflation, freedom: the drop under the multipliers is about `inflation` times a chi-square
-            of so many degrees of freedom (Satterthwaite 1946).
-        null: largest z of each group under the multipliers [groups, repetitions].
-        valid: hypotheses that were scored.
-    """
-
-    family: Family
-    drop: np.ndarray
-    z: np.ndarray
-    amplitude: np.ndarray
-    seen: np.ndarray
-    inflation: np.ndarray
-    freedom: np.ndarray
-    null: np.ndarray
-    valid: np.ndarray
-    variance: float
-
-    @property
-    def n(self) -> int:
-        """Number of hypotheses scored."""
-        return int(self.valid.sum())
-
-
-@dataclass(frozen=True)
-class Ranking:
-    """All families' scores, and the distribution of the largest z under noise."""
-
-    scores: tuple[Scores, ...]
-    null: np.ndarray
-
-    @property
-    def n(self) -> int:
-        """Number of hypotheses scored."""
-        return sum(s.n for s in self.scores)
-
-    def best_z(self) -> float:
-        """Largest statistic."""
-        return max((float(s.z[s.valid].max()) for s in self.scores if s.n), default=-np.inf)
-
-    def left_at(self, ports: set[str], scope: Scope) -> float:
-        """Probability that noise alone gives as much as is left at some ports of some bodies.
-
-        The family is that of the hypotheses about these ports, of any course: what the best course
-        of its kind should have explained.
-        """
-        p, families = 1.0, 0
-        for scores in self.scores:
-            for g, group in enumerate(scores.family.groups):
-                own = [s for s, other in enumerate(scores.family.scopes) if other == scope]
-                z = np.where(scores.valid[g][:, own], scores.z[g][:, own], -np.inf)
-                if {term.port for term in group.terms} <= ports and np.isfinite(z).any():
-                    null = scores.null[g]
-                    p = min(p, float((1 + np.sum(null >= z.max())) / (1 + len(null))))
-                    families += 1
-        return min(p * max(families, 1), 1.0)
-
-    def p_value(self, z: float) -> float:
-        """Probability that noise alone gives a statistic this large anywhere (family-wise)."""
-        return float((1 + np.sum(self.null >= z)) / (1 + len(self.null)))
 
 
 @dataclass(frozen=True)
@@ -415,82 +344,3 @@ def _without_local(cells: Cells) -> Float[np.ndarray, "cells rows"]:
     of_group = cells.by(cells.group, own).sum(axis=2)  # d G
     back = np.concatenate([of_group, np.zeros((d, 1))], axis=1)[:, cells.group_of]
     return cells.residual - np.einsum("dn,nrd->nr", back, half)
-
-
-def surprise(
-    chi_square: Float[np.ndarray, "..."], columns: Float[np.ndarray, "..."] | float
-) -> Float[np.ndarray, "..."]:
-    """About -2 ln p of a chi-square statistic: comparable whatever the number of columns.
-
-    The leading term of the upper tail, p ~ x^(s-1) e^-x / Gamma(s) with s = columns/2, x = half the
-    statistic; below the mean, where it does not hold, the statistic is taken at the mean.
-    """
-    x = 0.5 * np.maximum(chi_square, columns)
-    half = 0.5 * np.asarray(columns, float)
-    return 2.0 * (x - (half - 1.0) * np.log(x) + gammaln(half))
-
-
-def top(ranking: Ranking, scene: Scene, count: int) -> list[tuple[Hypothesis, float, np.ndarray]]:
-    """The leading hypotheses by z: (hypothesis, drop, one-step amplitudes).
-
-    Courses that differ only in their constants (instants, lags, periods) count as one: the best.
-    """
-    entries = []
-    for scores in ranking.scores:
-        z = np.where(scores.valid, scores.z, -np.inf)
-        kinds: dict[tuple[str, str], list[int]] = {}
-        for place, course in enumerate(scores.family.courses):
-            kinds.setdefault((course.driver, course.form), []).append(place)
-        for places in kinds.values():
-            own = z[:, places]
-            best = np.argmax(own, axis=1)
-            value = np.max(own, axis=1)
-            for g, s in np.argwhere(np.isfinite(value)):
-                entries.append((value[g, s], scores, (g, places[best[g, s]], s)))
-    entries.sort(key=lambda entry: -entry[0])
-    return [
-        (member(s.family, index, scene), float(s.drop[index]), s.amplitude[index])
-        for _, s, index in entries[:count]
-    ]
-
-
-def spread_of_constant(ranking: Ranking, hypothesis: Hypothesis, scene: Scene) -> float:
-    """Standard deviation of the first constant of a hypothesis over the courses that were asked.
-
-    The posterior over the grid, with a flat prior: weights exp(drop / 2). It is not less than what
-    the step of the grid leaves open.
-    """
-    for scores, g, own, s in _where(ranking, hypothesis, scene):
-        at = np.array([scores.family.courses[k].constants[0] for k in own])
-        drop = np.where(scores.valid[g, own, s], scores.drop[g, own, s], -np.inf)
-        weight = np.exp(0.5 * (drop - drop.max()) / scores.variance)
-        mean = float(weight @ at / weight.sum())
-        step = float(np.median(np.diff(np.unique(at)))) if len(at) > 1 else 0.0
-        return float(np.hypot(np.sqrt(weight @ (at - mean) ** 2 / weight.sum()), step / 3.5))
-    return 0.0
-
-
-def noise_of(ranking: Ranking, hypothesis: Hypothesis, scene: Scene) -> tuple[float, float] | None:
-    """Inflation and freedom of a hypothesis under the multipliers, at its most inflated course.
-
-    None where it was not scored: the model has it already.
-    """
-    met = [
-        (float(scores.inflation[g, k, s]), float(scores.freedom[g, k, s]))
-        for scores, g, own, s in _where(ranking, hypothesis, scene)
-        for k in own
-        if scores.valid[g, k, s]
-    ]
-    return max(met, default=None)
-
-
-def _where(ranking: Ranking, hypothesis: Hypothesis, scene: Scene):
-    """Scores, group, courses and scope of a hypothesis, whatever its constants."""
-    kind = hypothesis.course.driver, hypothesis.course.form
-    for scores in ranking.scores:
-        family = scores.family
-        own = [k for k, c in enumerate(family.courses) if (c.driver, c.form) == kind]
-        for g in (g for g, group in enumerate(family.groups) if group == hypothesis.group and own):
-            for s in map(int, np.flatnonzero(scores.valid[g, own].any(axis=0))):
-                if member(family, (g, own[0], s), scene).scope == hypothesis.scope:
-                    yield scores, g, own, s

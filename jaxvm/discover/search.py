@@ -12,17 +12,10 @@ from jaxvm.discover.diagnosis import Finding
 from jaxvm.discover.heldout import HeldOut, Split
 from jaxvm.discover.hypotheses import enumerate_hypotheses
 from jaxvm.discover.noise import LONGEST, memory, multipliers
+from jaxvm.discover.ranking import Ranking, noise_of, spread_of_constant, surprise
 from jaxvm.discover.revise import prune, rename
 from jaxvm.discover.rivals import rivals
-from jaxvm.discover.score import (
-    Battery,
-    Ranking,
-    battery,
-    noise_of,
-    score_residuals,
-    spread_of_constant,
-    surprise,
-)
+from jaxvm.discover.score import Battery, battery, score_residuals
 from jaxvm.discover.select import Candidate, identity, refit, shortlist, stacked
 from jaxvm.physics.forms import FORMS
 from jaxvm.solve.adjust import Adjustment

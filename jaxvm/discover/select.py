@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxvm.discover.heldout import Split
 from jaxvm.discover.hypotheses import FREE, Hypothesis
-from jaxvm.discover.score import Ranking, top
+from jaxvm.discover.ranking import Ranking, top
 from jaxvm.network.scene import Scene
 from jaxvm.physics.catalogue import Entry
 from jaxvm.physics.effects import Effect, room_for

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.stats import norm
 
 from jaxvm.discover.hypotheses import member
-from jaxvm.discover.score import Ranking
+from jaxvm.discover.ranking import Ranking
 from jaxvm.network.scene import Scene
 from jaxvm.physics.ports import PORTS
 
