@@ -199,6 +199,10 @@ def enumerate_hypotheses(scene: Scene) -> tuple[Family, ...]:
     """All hypotheses that a recording can be asked about."""
     scopes = _scopes(scene)
     courses = enumerate_courses(scene)
+    kinds = {
+        course.driver: kinds_in_scope(driver_kind(scene, course.driver), course.driver, Scope())
+        for course in courses
+    }
     single = [
         Group((Term(port.name),), _entity(port.name))
         for port in PORTS
@@ -231,12 +235,12 @@ def enumerate_hypotheses(scene: Scene) -> tuple[Family, ...]:
         (single, by_bases[2]),
         (patterned, constant),
         *((_of_size(moving, size), by_bases[n]) for size in (1, 2, 3) for n in (1, 2)),
-        *_as_named(scene, every_named, courses, listed),
+        *_as_named(every_named, courses, kinds, listed),
         (marks, courses_of_marks(courses, len(marks))),
         *_free_forms(scene, constant),
         *_of_each_mark(scene, constant),
     ]
-    asked = _asked_of_names(scene, courses)
+    asked = _asked_of_names(courses, kinds)
     families = (
         _family(scene, groups, own, scopes, asked) for groups, own in candidates if groups and own
     )
@@ -269,17 +273,11 @@ def _variants(entry: Entry, group: Group) -> int:
     return sum(alike == [(t.port, t.driver, t.basis) for t in own] for own in entry.groups) or 1
 
 
-def _asked_of_names(scene: Scene, courses: list[Course]) -> dict[str, int]:
+def _asked_of_names(courses: list[Course], kinds: dict[str, tuple[str, ...]]) -> dict[str, int]:
     """Number of drivers and forms in which each entry of the catalogue is asked."""
     distinct = {(course.driver, course.form) for course in courses}
-    kinds = {d: kinds_in_scope(driver_kind(scene, d), d, Scope()) for d, _ in distinct}
     return {
-        entry.id: max(
-            sum(
-                f in entry.forms and any(k in entry.drivers for k in kinds[d]) for d, f in distinct
-            ),
-            1,
-        )
+        entry.id: max(sum(entry.takes(kinds[driver], form) for driver, form in distinct), 1)
         for entry in CATALOGUE
     }
 
@@ -317,15 +315,16 @@ def _family(scene: Scene, groups, courses, scopes, named: dict[str, int]) -> Fam
     )
 
 
-def _as_named(scene: Scene, groups: list[Group], courses: list[Course], listed: set[Group]):
+def _as_named(
+    groups: list[Group],
+    courses: list[Course],
+    kinds: dict[str, tuple[str, ...]],
+    listed: set[Group],
+):
     """Groups and courses that are asked only where the catalogue has a name for both together.
 
     Those that are `listed` are asked with the constant course already.
     """
-    kinds = {
-        course.driver: kinds_in_scope(driver_kind(scene, course.driver), course.driver, Scope())
-        for course in courses
-    }
     # At the ends of a recording a step is a constant, which a map without a name explains.
     steps = [place for place, course in enumerate(courses) if course.form == "step"]
     within = steps[len(steps) // 8 : len(steps) - len(steps) // 8]
@@ -340,10 +339,7 @@ def _as_named(scene: Scene, groups: list[Group], courses: list[Course], listed: 
             for place, course in enumerate(courses)
             if not (many and course.form == "step" and place not in within)
             and (course.form in NAMED_ONLY or (patterned and (place or group not in listed)))
-            and any(
-                course.form in e.forms and any(kind in e.drivers for kind in kinds[course.driver])
-                for e in entries
-            )
+            and any(entry.takes(kinds[course.driver], course.form) for entry in entries)
         )
         for n in (1, 2, 3):
             of_size = tuple(k for k in own if len(FORMS[courses[k].form].bases) == n)

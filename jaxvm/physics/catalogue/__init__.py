@@ -37,10 +37,7 @@ def entries_for(
     known = [
         entry
         for entry in CATALOGUE
-        if terms in entry.groups
-        and entity == entry.entity
-        and form in entry.forms
-        and any(kind in entry.drivers for kind in driver_kinds)
+        if terms in entry.groups and entity == entry.entity and entry.takes(driver_kinds, form)
     ]
     special = driver_kinds[1:] or driver_kinds
     return tuple([e for e in known if any(kind in e.drivers for kind in special)] or known)

@@ -42,6 +42,10 @@ class Entry:
     separate_by: str
     explanation: str
 
+    def takes(self, kinds: tuple[str, ...], form: str) -> bool:
+        """Whether a driver of any of these kinds may drive it in a form."""
+        return form in self.forms and any(kind in self.drivers for kind in kinds)
+
 
 THERMAL = ("linear", "lag", "two lags", "affine", "affine lag")
 """Forms of what follows a quantity, at once or late."""
