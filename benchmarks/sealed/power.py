@@ -227,14 +227,10 @@ def best_by_name(
     drops: dict[str, float] = {}
     evidence: dict[str, float] = {}
     for scores in ranking.scores:
-        family, largest = scores.family, {}
-        for g, c, s in np.argwhere(scores.valid):
-            course = family.courses[c]
-            key = (g, s, course.driver, course.form)
-            drop = float(scores.drop[g, c, s]) / variance
-            if drop > largest.get(key, ((), -np.inf))[1]:
-                largest[key] = ((g, c, s), drop)
-        for index, drop in largest.values():
+        family = scores.family
+        values = np.where(scores.valid, scores.drop, -np.inf) / variance
+        for index in sorted(family.with_best_constants(values)):
+            drop = float(values[index])
             entries = member(family, index, scene).entries
             unknowns = family.n_terms * family.n_bases + len(family.courses[index[1]].constants)
             for name in [entry.id for entry in entries] or [""]:

@@ -117,6 +117,26 @@ class Family:
         """Bases of each course."""
         return len(FORMS[self.courses[0].form].bases)
 
+    def by_driver_and_form(self) -> dict[tuple[str, str], list[int]]:
+        """Places of the courses that differ in their constants alone."""
+        places: dict[tuple[str, str], list[int]] = {}
+        for place, course in enumerate(self.courses):
+            places.setdefault((course.driver, course.form), []).append(place)
+        return places
+
+    def with_best_constants(self, values: np.ndarray) -> list[tuple[int, int, int]]:
+        """Of members that differ in the constants of their courses alone the one of largest value.
+
+        `values` [groups, courses, scopes] are -inf for members that don't count.
+        """
+        best = []
+        for places in self.by_driver_and_form().values():
+            own = values[:, places]
+            at = np.argmax(own, axis=1)
+            found = np.argwhere(np.isfinite(own.max(axis=1)))
+            best += [(int(g), places[at[g, s]], int(s)) for g, s in found]
+        return best
+
 
 @dataclass(frozen=True)
 class Hypothesis:

@@ -103,15 +103,7 @@ def top(ranking: Ranking, scene: Scene, count: int) -> list[tuple[Hypothesis, fl
     entries = []
     for scores in ranking.scores:
         z = np.where(scores.valid, scores.z, -np.inf)
-        kinds: dict[tuple[str, str], list[int]] = {}
-        for place, course in enumerate(scores.family.courses):
-            kinds.setdefault((course.driver, course.form), []).append(place)
-        for places in kinds.values():
-            own = z[:, places]
-            best = np.argmax(own, axis=1)
-            value = np.max(own, axis=1)
-            for g, s in np.argwhere(np.isfinite(value)):
-                entries.append((value[g, s], scores, (g, places[best[g, s]], s)))
+        entries += [(z[index], scores, index) for index in scores.family.with_best_constants(z)]
     entries.sort(key=lambda entry: -entry[0])
     return [
         (member(s.family, index, scene), float(s.drop[index]), s.amplitude[index])
@@ -154,7 +146,7 @@ def _where(ranking: Ranking, hypothesis: Hypothesis, scene: Scene):
     kind = hypothesis.course.driver, hypothesis.course.form
     for scores in ranking.scores:
         family = scores.family
-        own = [k for k, c in enumerate(family.courses) if (c.driver, c.form) == kind]
+        own = family.by_driver_and_form().get(kind, [])
         for g in (g for g, group in enumerate(family.groups) if group == hypothesis.group and own):
             for s in map(int, np.flatnonzero(scores.valid[g, own].any(axis=0))):
                 if member(family, (g, own[0], s), scene).scope == hypothesis.scope:

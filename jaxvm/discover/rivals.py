@@ -169,12 +169,9 @@ def _resembling(ranking: Ranking, scene, own: Hypothesis, full: float, variance:
     for scores in ranking.scores:
         family = scores.family
         drops = np.where(scores.valid, scores.drop, -np.inf) / variance
-        kinds: dict[tuple[str, str], list[int]] = {}
-        for place, course in enumerate(family.courses):
-            kinds.setdefault((course.driver, course.form), []).append(place)
-        for (driver, form), places in kinds.items():
+        for kind, places in family.by_driver_and_form().items():
             best = drops[:, places].max(axis=1)
-            mine = (own.course.driver, own.course.form) == (driver, form)
+            mine = (own.course.driver, own.course.form) == kind
             for g, s in np.argwhere(best >= full - DECIDED if not mine else np.isfinite(best)):
                 if best[g, s] < full - DECIDED and family.groups[g].terms != own.group.terms:
                     continue
@@ -190,11 +187,7 @@ def _at(families: tuple[Family, ...], effect: Effect) -> tuple[Family, ...]:
     """All groups with the refined constants of an effect; none where it has none."""
     found = []
     for family in families if effect.constants else ():
-        own = [
-            place
-            for place, course in enumerate(family.courses)
-            if (course.driver, course.form) == (effect.driver, effect.form)
-        ]
+        own = family.by_driver_and_form().get((effect.driver, effect.form), [])
         first = own[0] if own else 0
         if own and family.valid[:, first].any():
             course = Course(effect.driver, effect.form, effect.constants, effect.reference)
