@@ -434,9 +434,9 @@ def _free_forms(scene: Scene, constant: list[Course]):
 
 def _of_each_mark(scene: Scene, constant: list[Course]):
     """Physics that every mark of a target has to an extent of its own."""
-    signatures = {
+    signatures = dict.fromkeys(
         terms for entry in CATALOGUE for terms in entry.groups if terms[0].driver == "mark"
-    }
+    )
     for target, first in zip(scene.model.targets, scene.first_point, strict=False):
         if "points" in target.free:
             continue
