@@ -303,24 +303,14 @@ def _asked_of_names(courses: list[Course], kinds: dict[str, tuple[str, ...]]) ->
 
 
 def _family(scene: Scene, groups, courses, scopes, named: dict[str, int]) -> Family:
-    kinds = [_kind(scope) for scope in scopes]
     driven = [driver_kind(scene, course.driver) for course in courses]
     distinct = set(zip(driven, ((c.driver, c.form) for c in courses), strict=True))
     asked = Counter(kind for kind, _ in distinct)
-    valid = np.zeros((len(groups), len(courses), len(scopes)), bool)
-    for g, group in enumerate(groups):
-        for c, course in enumerate(courses):
-            for s, scope in enumerate(scopes):
-                if group.mark is not None:
-                    valid[g, c, s] = s == 0
-                    continue
-                valid[g, c, s] = kinds[s] == group.entity
-                valid[g, c, s] &= not group.target or scope.target == (group.target,)
-                if course.driver in (OWN_BODY, OWN_POWER_ON):
-                    valid[g, c, s] &= len(scope.camera) > 1
-                if course.driver.startswith("time since power-on of "):
-                    camera = course.driver.removeprefix("time since power-on of ")
-                    valid[g, c, s] &= scope.camera == (camera,)
+    group_scope = np.array([[_has(scope, group) for scope in scopes] for group in groups])
+    course_scope = np.array([[_follows(s, course.driver) for s in scopes] for course in courses])
+    # A mark belongs to no camera, and is asked with every course.
+    of_mark = np.array([group.mark is not None for group in groups])
+    valid = group_scope[:, None, :] & (course_scope[None] | of_mark[:, None, None])
     # What nothing in this recording has (a rangefinder, say) is not computed either.
     seen = np.flatnonzero(valid.any(axis=(1, 2)))
     kept = tuple(groups[g] for g in seen)
@@ -333,6 +323,21 @@ def _family(scene: Scene, groups, courses, scopes, named: dict[str, int]) -> Fam
         tuple(asked[kind] for kind in driven),
         named,
     )
+
+
+def _has(scope: Scope, group: Group) -> bool:
+    """Whether the bodies of a scope have a group; a mark, which has its own, is in that of all."""
+    if group.mark is not None:
+        return scope == Scope()
+    return _kind(scope) == group.entity and (not group.target or scope.target == (group.target,))
+
+
+def _follows(scope: Scope, driver: str) -> bool:
+    """Whether a driver is one for the bodies of a scope: some belong to single cameras."""
+    if driver in (OWN_BODY, OWN_POWER_ON):
+        return len(scope.camera) > 1
+    camera = driver.removeprefix("time since power-on of ")
+    return camera == driver or scope.camera == (camera,)
 
 
 def _as_named(
