@@ -29,7 +29,6 @@ class Finding:
         rivals: hypotheses that this recording can't tell from it.
         p_value: family-wise, under noise that remembers as long as the residuals do.
         p_independent: the same for noise that is independent from epoch to epoch.
-        z: the surprise with which it led its round.
         noise: its drop under noise that remembers as long as the residuals do is about the first of
             these numbers times a chi-square with the second as its degrees of freedom.
         n_hypotheses: how many were tried.
@@ -55,7 +54,6 @@ class Finding:
     rivals: tuple[Rival, ...]
     p_value: float
     p_independent: float
-    z: float
     n_hypotheses: int
     drop: float
     share: float

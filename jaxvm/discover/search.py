@@ -184,7 +184,6 @@ class Search:
             rivals=tuple(doubles),
             p_value=self.p_value,
             p_independent=self.p_value,
-            z=self.ranking.best_z(),
             n_hypotheses=self.ranking.n,
             drop=2.0 * (current.cost - chosen.adjustment.cost),
             share=0.0,
