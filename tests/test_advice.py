@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from jaxvm.discover.advice import _information, advise
 from jaxvm.discover.courses import Course
-from jaxvm.discover.hypotheses import Group, Hypothesis
+from jaxvm.discover.groups import Group
+from jaxvm.discover.hypotheses import Hypothesis
 from jaxvm.discover.plans import PLANS, Plan, planned, possible
 from jaxvm.geometry.targets import grid_points
 from jaxvm.network.residual import predict_pixels

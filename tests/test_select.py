@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from jaxvm.discover.courses import Course
-from jaxvm.discover.hypotheses import Group, Hypothesis
+from jaxvm.discover.groups import Group
+from jaxvm.discover.hypotheses import Hypothesis
 from jaxvm.discover.select import best_named, identity, log_prior
 from jaxvm.physics.catalogue import entries_for
 from jaxvm.physics.effects import Scope, Term

@@ -11,8 +11,9 @@ import numpy as np
 
 from jaxvm.discover.courses import Course
 from jaxvm.discover.diagnosis import Finding
+from jaxvm.discover.groups import Group
 from jaxvm.discover.heldout import HeldOut, Split, gain
-from jaxvm.discover.hypotheses import Group, Hypothesis
+from jaxvm.discover.hypotheses import Hypothesis
 from jaxvm.network.scene import Scene
 from jaxvm.physics.catalogue.maps import fine_plate_map, finest_image_map
 from jaxvm.physics.effects import Effect, room_for

@@ -18,6 +18,15 @@ from jaxvm.discover.courses import (
     kinds_in_scope,
 )
 from jaxvm.discover.curves import CURVED, CURVED_FAST, curved_drivers
+from jaxvm.discover.groups import (
+    Group,
+    entity_of,
+    every_port,
+    is_patterned,
+    marks_of,
+    patterned_groups,
+    single_groups,
+)
 from jaxvm.network.scene import Scene
 from jaxvm.physics.catalogue import CATALOGUE, Entry, entries_for
 from jaxvm.physics.catalogue.entry import each_mark
@@ -26,39 +35,6 @@ from jaxvm.physics.drivers import OWN_BODY, OWN_POWER_ON
 from jaxvm.physics.effects import Effect, Scope, Term
 from jaxvm.physics.forms import FORMS
 from jaxvm.physics.ports import PORTS
-
-_ENTITY_OF_STAGE = {
-    "target": "target",
-    "structure": "target",
-    "station": "station",
-    "medium": "station",
-    "shutter": "camera",
-    "mount": "camera",
-    "lens": "camera",
-    "sensor": "camera",
-    "detection": "camera",
-    "range": "rangefinder",
-}
-_STAGE = {port.name: port.stage for port in PORTS}
-
-_PATTERNS: tuple[tuple[str, str, tuple[float, ...]], ...] = (
-    *((driver, basis, ()) for driver in ("row", "column") for basis in ("linear", "square")),
-    *(("radius", basis, ()) for basis in ("linear", "square", "fourth", "sixth")),
-    *((driver, "linear", ()) for driver in ("image_x", "image_y", "range", "inverse_range")),
-    *(("incidence", basis, ()) for basis in ("linear", "square")),
-    *((driver, "linear", ()) for driver in ("motion_u", "motion_v", "up_x", "up_y", "up_z")),
-    *((d, basis, ()) for d in ("target_x", "target_y") for basis in ("linear", "square", "cube")),
-    *(
-        (driver, basis, (period,))
-        for driver in ("pixel_u", "pixel_v")
-        for period in (1.0, 2.0)
-        for basis in ("sine", "cosine")
-    ),
-)
-_TWICE = {("target.point_z", "target_x", "square"), ("target.point_z", "target_y", "square")}
-"""Patterns that are ports by another name: these are `target.bow_x` and `bow_y`."""
-
-_PATTERNED_PORTS = ("detect.u", "detect.v", "sensor.focal", "target.point_z")
 
 NAMED_ONLY = (
     "affine",
@@ -75,18 +51,6 @@ NAMED_ONLY = (
 
 FREE = 8
 """A hypothesis with more columns than this is a free form: a curve or a map."""
-
-
-@dataclass(frozen=True)
-class Group:
-    """Terms that share a scope, and the kind of entity that has them."""
-
-    terms: tuple[Term, ...]
-    entity: str
-    mark: tuple[int, int] | None = None
-    """(target, point) when a single mark is meant."""
-    target: str = ""
-    """The only target that can have it, where the terms name its marks."""
 
 
 @dataclass(frozen=True)
@@ -223,18 +187,6 @@ def enumerate_hypotheses(scene: Scene) -> tuple[Family, ...]:
         course.driver: kinds_in_scope(driver_kind(scene, course.driver), course.driver, Scope())
         for course in courses
     }
-    single = [
-        Group((Term(port.name),), _entity(port.name))
-        for port in PORTS
-        # Without a pattern a detector that measures too far is a principal point that moved.
-        if port.name not in ("detect.u", "detect.v")
-    ]
-    patterned = [
-        Group((Term(port, driver, basis, constants),), _entity(port))
-        for port in _PATTERNED_PORTS
-        for driver, basis, constants in _PATTERNS
-        if (port, driver, basis) not in _TWICE
-    ]
     named = [
         Group(terms, entry.entity)
         for entry in CATALOGUE
@@ -242,14 +194,15 @@ def enumerate_hypotheses(scene: Scene) -> tuple[Family, ...]:
         for terms in entry.groups
         if terms[0].driver != "mark"
     ]
+    single, patterned = single_groups(), patterned_groups()
     # Named groups without a pattern follow every course; the others only those that have a name.
     listed = {*single, *patterned}
     every_named = list(dict.fromkeys(named))
-    moving = [g for g in every_named if g not in listed and not _is_patterned(g)]
+    moving = [g for g in every_named if g not in listed and not is_patterned(g)]
     common = [course for course in courses if course.form not in NAMED_ONLY]
     by_bases = {n: [c for c in common if len(FORMS[c.form].bases) == n] for n in (1, 2)}
     constant = [Course("constant", "constant")]
-    marks = _marks(scene)
+    marks = marks_of(scene)
     candidates = [
         (single, by_bases[1]),
         (single, by_bases[2]),
@@ -354,10 +307,9 @@ def _as_named(
     steps = [place for place, course in enumerate(courses) if course.form == "step"]
     within = steps[len(steps) // 8 : len(steps) - len(steps) // 8]
     together: dict[tuple, list[Group]] = {}
-    singles = [Group((Term(port.name),), _entity(port.name)) for port in PORTS]
-    for group in [*groups, *singles]:
+    for group in [*groups, *every_port()]:
         entries = [e for e in CATALOGUE if group.terms in e.groups and e.entity == group.entity]
-        patterned = _is_patterned(group)
+        patterned = is_patterned(group)
         many = len(group.terms) > FREE
         own = tuple(
             place
@@ -374,17 +326,8 @@ def _as_named(
         yield members, [courses[k] for k in places]
 
 
-def _is_patterned(group: Group) -> bool:
-    return any(term.driver not in ("one", "along_beam") for term in group.terms)
-
-
 def _of_size(groups: list[Group], n_terms: int) -> list[Group]:
     return [group for group in groups if len(group.terms) == n_terms]
-
-
-def _entity(port: str) -> str:
-    # A window belongs to its camera, the air to all cameras of a station alike.
-    return "camera" if port == "medium.window" else _ENTITY_OF_STAGE[_STAGE[port]]
 
 
 def _kind(scope: Scope) -> str:
@@ -427,7 +370,7 @@ def _free_forms(scene: Scene, constant: list[Course]):
         curves = [Course(name, form, own) for name, own in curved_drivers(scene, form)]
         for n in (1, 2, 3):
             groups = [
-                Group(tuple(Term(port) for port in ports), _entity(ports[0]))
+                Group(tuple(Term(port) for port in ports), entity_of(ports[0]))
                 for ports in curved
                 if len(ports) == n
             ]
@@ -451,13 +394,3 @@ def _of_each_mark(scene: Scene, constant: list[Course]):
             [Group(each_mark(*own, marks=marks), "target", target=target.name) for own in ports],
             constant,
         )
-
-
-def _marks(scene: Scene) -> list[Group]:
-    groups = []
-    terms = next(entry for entry in CATALOGUE if entry.entity == "mark").groups[0]
-    for t, target in enumerate(scene.model.targets):
-        if "points" in target.free:
-            continue
-        groups += [Group(terms, "mark", (t, p)) for p in range(len(target.point_names))]
-    return groups
