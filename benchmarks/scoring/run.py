@@ -15,8 +15,10 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from jaxvm.discover.cells import arrange
 from jaxvm.discover.hypotheses import enumerate_hypotheses
-from jaxvm.discover.score import score
+from jaxvm.discover.noise import multipliers
+from jaxvm.discover.score import battery, score_residuals
 from jaxvm.network.scene import build
 from jaxvm.network.start import start
 from jaxvm.recording import read_recording
@@ -32,14 +34,22 @@ def main() -> None:
     fitted = adjust(start(build(recording)).with_effects((), (16, 8)))
     families = enumerate_hypotheses(fitted.scene)
     # Every sixth course: about the 5,000 hypotheses that the target speaks of.
-    few = tuple(replace(f, courses=f.courses[::6], valid=f.valid[:, ::6]) for f in families)
+    few = tuple(
+        replace(
+            f, courses=f.courses[::6], valid=f.valid[:, ::6], kinds=f.kinds[::6], asked=f.asked[::6]
+        )
+        for f in families
+    )
     few = tuple(family for family in few if family.valid.any())
     rows = []
     for asked, flips in ((few, 299), (families, 0), (families, 299)):
         seconds = []
         for _ in range(4):
             began = time.perf_counter()
-            ranking, _ = score(fitted, asked, 1.0, max(flips, 1))
+            arrangement = arrange(fitted)
+            signs = multipliers(len(recording.time), 1, max(flips, 1), 0) * float(flips > 0)
+            own = battery(fitted.scene, arrangement, asked)
+            ranking = score_residuals(fitted.scene, arrangement, own, 1.0, signs)
             seconds.append(time.perf_counter() - began)
         rows.append(
             {
