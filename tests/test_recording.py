@@ -8,6 +8,8 @@ import pandas as pd
 import pytest
 from networks import board_recording, relay_recording, stereo_recording
 
+from jaxvm.physics.catalogue.entry import each
+from jaxvm.physics.catalogue.maps import fine_plate_map, image_map
 from jaxvm.physics.effects import Effect, Scope, Term
 from jaxvm.recording import RecordingError, model_text, read_model, read_recording, write_recording
 from jaxvm.recording.files import new_folder, write_files
@@ -65,6 +67,20 @@ def test_effects_are_part_of_a_model(folder):
         amplitudes=(1e-5, 0.01),
         catalogue_id="mount-turn",
     )
+    text = model_text(type(model)(**{**vars(model), "effects": (effect,)}))
+    (folder / "recording.toml").write_text(text)
+    assert read_recording(folder).model.effects == (effect,)
+
+
+@pytest.mark.parametrize(
+    "terms",
+    [image_map(), fine_plate_map(), each("epoch", "sensor.cx", "sensor.cy", numbers=range(7)),
+     (Term("detect.v", "pixels", "cosine", (0.004, -0.002)),)],
+    ids=["image", "plate", "epochs", "wave"],
+)  # fmt: skip
+def test_patterns_that_a_diagnosis_adds_are_read_back(folder, terms):
+    model, _ = read_model(folder / "recording.toml")
+    effect = Effect("found", terms, amplitudes=tuple(0.1 * k for k in range(len(terms))))
     text = model_text(type(model)(**{**vars(model), "effects": (effect,)}))
     (folder / "recording.toml").write_text(text)
     assert read_recording(folder).model.effects == (effect,)

@@ -43,6 +43,7 @@ OBSERVATION_DRIVERS: dict[str, str] = {
     "target_y": "half height",
     "checker": "1",
     "mark": "1",
+    "epoch": "1",
     "along_beam": "1",
     "up_x": "1",
     "up_y": "1",
@@ -59,8 +60,12 @@ PLANES: dict[str, tuple[str, str, float]] = {
     "finest image": ("image_x", "image_y", 0.095),
     "plate": ("target_x", "target_y", 0.5),
     "fine plate": ("target_x", "target_y", 0.25),
+    "pixels": ("pixel_u", "pixel_v", 1.0),
 }
 """Two observation-like drivers together, and the spacing of the tiles of a map over them."""
+
+PLANE_BASES = ("tile", "sine", "cosine")
+"""Patterns over a plane: a bump about a place, or a wave of so many cycles per unit along both."""
 
 OWN_BODY, OWN_POWER_ON = "own_body_degC", "time since own power-on"
 """Drivers that each camera has for itself."""
@@ -115,7 +120,7 @@ def observation_drivers(
     sight and the target's normal, `incidence_u, _v` the image direction into which the normal
     leans times sin i cos i (the pattern of the eccentricity of circular marks); `checker` is +1 and
     -1 in turn over the marks of a grid, NaN without one; `mark` is the number of the mark among all
-    targets'; `along_beam` goes from -1 to 1 over the cameras of a station.
+    targets', `epoch` that of the epoch; `along_beam` goes from -1 to 1 over a station's cameras.
     """
     at = circumstances
     world_from_target = pose_from_vector(sight.world_from_target)
@@ -161,6 +166,7 @@ def observation_drivers(
             in_target[1],
             at.checker,
             at.mark,
+            at.epoch,
             at.along_beam,
             up_cam[0],
             up_cam[1],
@@ -207,7 +213,8 @@ def pattern(
         x_name, y_name, width = PLANES[term.driver]
         columns = [OBSERVATION_DRIVER_INDEX[name] for name in (x_name, y_name)]
         x = table[:, np.array(columns)]
-        evaluate, known = partial(_spot, width=width), jnp.isfinite(x).all(axis=1)
+        tile, wave = partial(_spot, width=width), partial(_wave, name=term.basis)
+        evaluate, known = tile if term.basis == "tile" else wave, jnp.isfinite(x).all(axis=1)
     else:
         x = table[:, OBSERVATION_DRIVER_INDEX[term.driver]]
         evaluate, known = partial(_basis, name=term.basis), jnp.isfinite(x)
@@ -221,6 +228,11 @@ def pattern(
 def _basis(x, constants, name: str):
     x = jnp.where(jnp.isfinite(x), x, 0.0)
     return BASES[name](x, x, constants)
+
+
+@partial(jax.jit, static_argnames="name")
+def _wave(x, constants, name: str):
+    return BASES[name](x @ constants, x[:, 0], jnp.ones(2))
 
 
 @jax.jit

@@ -7,7 +7,7 @@ from typing import Any, cast
 import numpy as np
 
 from jaxvm.geometry.targets import grid_points
-from jaxvm.physics.drivers import OBSERVATION_DRIVERS
+from jaxvm.physics.drivers import OBSERVATION_DRIVERS, PLANE_BASES, PLANES
 from jaxvm.physics.effects import Effect, Scope, Term
 from jaxvm.physics.forms import BASES, FORMS
 from jaxvm.physics.ports import PORT_INDEX
@@ -359,10 +359,11 @@ def _term(entry: Entry) -> Term:
     constants = entry.table.get("constants", [])
     width = len(constants) if isinstance(constants, list) else 0
     vector = entry.vector("constants", min(width, 2))
+    driver = entry.choice("driver", (*OBSERVATION_DRIVERS, *PLANES), "one")
     return Term(
         port=entry.choice("port", tuple(PORT_INDEX)),
-        driver=entry.choice("driver", tuple(OBSERVATION_DRIVERS), "one"),
-        basis=entry.choice("basis", tuple(BASES), "one"),
+        driver=driver,
+        basis=entry.choice("basis", PLANE_BASES if driver in PLANES else tuple(BASES), "one"),
         constants=() if vector is None else tuple(vector.tolist()),
         weight=entry.number("weight", 1.0) or 0.0,
     )
