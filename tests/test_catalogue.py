@@ -11,12 +11,13 @@ from networks import matrix, stereo_recording, to_plane, to_point
 
 from jaxvm.discover.courses import driver_kind
 from jaxvm.discover.hypotheses import Hypothesis, enumerate_hypotheses, member
+from jaxvm.discover.scatter import families_of_images
 from jaxvm.network.binding import in_scope, range_driver_table
 from jaxvm.network.residual import residual
 from jaxvm.network.scene import Scene, build
 from jaxvm.network.tables import along_beam
 from jaxvm.physics.catalogue import BY_ID, CATALOGUE, entries_for
-from jaxvm.physics.catalogue.entry import each_mark
+from jaxvm.physics.catalogue.entry import each
 from jaxvm.physics.catalogue.range import UNITS_M
 from jaxvm.physics.drivers import (
     CHANNEL_UNITS,
@@ -160,7 +161,7 @@ def test_the_kind_of_a_channel_decides_the_name():
     image = (Term("sensor.cx"), Term("sensor.cy"))
     assert names(image, "target", "linear", "quantity", "light") == ["side-light"]
     # What each mark has for itself is named whatever their number.
-    marks = each_mark("target.point_z", marks=range(7, 20))
+    marks = each("mark", "target.point_z", numbers=range(7, 20))
     assert names(marks, "target", "constant", "constant") == ["marks-of-other-depth"]
 
 
@@ -202,7 +203,7 @@ def first_names() -> dict[str, Hypothesis]:
     """For each entry that some hypothesis may be called by: one such hypothesis."""
     found: dict[str, Hypothesis] = {}
     for scene in (logged_scene(), parted_scene()):
-        for family in enumerate_hypotheses(scene):
+        for family in (*enumerate_hypotheses(scene), *families_of_images(scene)):
             for g, c in np.argwhere(family.valid.any(axis=2)):
                 s = int(np.argmax(family.valid[g, c]))
                 hypothesis = member(family, (g, c, s), scene)
@@ -330,7 +331,7 @@ def test_a_seam_parts_the_image():
 def test_each_mark_has_its_own_column():
     table = np.zeros((3, len(OBSERVATION_DRIVERS)))
     table[:, OBSERVATION_DRIVER_INDEX["mark"]] = [4.0, 5.0, 6.0]
-    terms = each_mark("target.point_z", marks=range(4, 7))
+    terms = each("mark", "target.point_z", numbers=range(4, 7))
     columns = [np.asarray(pattern(term, table)) * term.weight for term in terms]
     np.testing.assert_allclose(columns, np.eye(3), atol=1e-15)
 

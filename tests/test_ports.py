@@ -38,6 +38,7 @@ GENERAL = Circumstances(
     target_half_size=np.array([0.6, 0.4]),
     checker=np.array(1.0),
     mark=np.array(3.0),
+    epoch=np.array(7.0),
     along_beam=np.array(-1.0),
     velocity=np.array([0.7, -0.4, 0.5, 0.3, -0.2, 0.4]),
 )
@@ -596,7 +597,7 @@ def _bench_arrays(bench):
         point=bench.point,
     )
     at = Circumstances(
-        (CX, bench.row), ROWS, bench.centre, bench.half_size, 1.0, 0.0, 0.0, bench.velocity
+        (CX, bench.row), ROWS, bench.centre, bench.half_size, 1.0, 0.0, 0.0, 0.0, bench.velocity
     )
     return (
         Sight(*(np.asarray(x, float) for x in sight)),

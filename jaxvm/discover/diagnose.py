@@ -20,6 +20,7 @@ from jaxvm.discover.heldout import (
     split,
 )
 from jaxvm.discover.locate import ResidualTable, locate, residual_table
+from jaxvm.discover.scatter import ALIKE, likeness
 from jaxvm.discover.scopes import sharing
 from jaxvm.discover.search import ALPHA, Search
 from jaxvm.discover.visible import smallest_visible
@@ -92,7 +93,8 @@ def diagnose(
     before = _table(plain, plain_heldout, scene, parts.sound)
     after = _table(final, None, scene, parts.sound)
     noise = np.sqrt(robust_variance(final)) * reference_sigma(scene)
-    significant = found.p_value <= alpha
+    alike = likeness(current.scene, parts.residuals(current))
+    significant = found.p_value <= alpha or alike > ALIKE
     return Diagnosis(
         recording=recording,
         verdict=_verdict(findings, significant),
@@ -110,6 +112,7 @@ def diagnose(
         heldout_before=plain_heldout,
         heldout_after=found.heldout,
         scene=final.scene,
+        likeness=alike,
         n_rejected=n_rejected,
         n_hypotheses=found.ranking.n,
         unproven=found.unproven,

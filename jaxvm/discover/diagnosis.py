@@ -94,6 +94,7 @@ class Diagnosis:
         held: epochs that were set aside.
         heldout_before, heldout_after: squares by held-out epoch.
         scene: the last model, fitted to all epochs.
+        likeness: correlation of neighbouring marks in one image, of what is left.
         n_rejected: gross errors set aside.
         n_hypotheses: hypotheses in the last round.
         unproven: the leading name for what is left, where it did not pass on held-out epochs.
@@ -117,6 +118,7 @@ class Diagnosis:
     heldout_before: HeldOut
     heldout_after: HeldOut
     scene: Scene
+    likeness: float
     n_rejected: int
     n_hypotheses: int
     unproven: str

@@ -149,7 +149,7 @@ def evaluate(scene: Scene, held: np.ndarray, sound: tuple[np.ndarray, ...]) -> H
         scene,
         weights=weights,
         range_weights=range_weights_of(scene, held),
-        active=scene.unknowns.of_one_epoch,
+        active=_of_these(scene, weights),
         rtol=1e-7,
         damping=1e-6,
         check=False,
@@ -160,9 +160,32 @@ def evaluate(scene: Scene, held: np.ndarray, sound: tuple[np.ndarray, ...]) -> H
     for rows, weight, block in zip(scene.tables, weights, residuals.pixels, strict=True):
         np.add.at(square, epoch[rows], np.sum(np.asarray(block) ** 2, axis=1))
         np.add.at(count, epoch[rows], 2.0 * (weight > 0))
+    # What an epoch has for itself fits its noise, too.
+    square *= count / np.maximum(count - _amplitudes(scene, len(held)), 1.0)
     ranges = 0.0 if residuals.ranges is None else float(np.sum(np.asarray(residuals.ranges) ** 2))
     rms = float(np.sqrt(square[held].sum() / max(count[held].sum(), 1.0)))
     return HeldOut(rms * reference_sigma(scene), square[held], count[held], ranges, fitted.scene)
+
+
+def _of_these(scene: Scene, weights) -> np.ndarray:
+    """Unknowns that one epoch has for itself, of the epochs with weight alone."""
+    felt = np.zeros(scene.network.effects.n_columns, bool)
+    for factor, weight in zip(scene.network.pixels, weights, strict=True):
+        own = np.asarray(factor.pattern)[: len(weight)][weight > 0]
+        felt |= np.any(own != 0.0, axis=0)
+    active = scene.unknowns.of_one_epoch
+    columns = scene.unknowns.column[scene.network.layout.all("amplitude")]
+    active[columns[~felt]] = False
+    return active
+
+
+def _amplitudes(scene: Scene, n_epochs: int) -> np.ndarray:
+    """Number of amplitudes that each epoch has for itself."""
+    number = np.zeros(n_epochs)
+    for term in (term for effect in scene.effects for term in effect.terms):
+        if term.driver == "epoch":
+            number[int(term.constants[0])] += 1.0
+    return number
 
 
 def gain(before: HeldOut, after: HeldOut, seed: int = 0, repetitions: int = 2000) -> Gain:

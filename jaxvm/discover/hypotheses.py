@@ -5,6 +5,7 @@ A *group* is what enters where (terms), a *course* how it runs in time (driver, 
 the shapes of their products when they are scored.
 """
 
+import math
 from collections import Counter
 from dataclasses import dataclass, field
 
@@ -29,7 +30,7 @@ from jaxvm.discover.groups import (
 )
 from jaxvm.network.scene import Scene
 from jaxvm.physics.catalogue import CATALOGUE, Entry, entries_for
-from jaxvm.physics.catalogue.entry import each_mark
+from jaxvm.physics.catalogue.entry import EACH, each
 from jaxvm.physics.catalogue.maps import fine_image_map, image_map, plate_map
 from jaxvm.physics.drivers import OWN_BODY, OWN_POWER_ON
 from jaxvm.physics.effects import Effect, Scope, Term
@@ -161,6 +162,7 @@ _MAPS = {
     "finest image": "the detector errs by a map with fine detail over the image",
     "fine plate": "the target stands off its plane by a smooth surface",
     "plate": "the target stands off its plane by a smooth surface",
+    "pixels": "the detector errs by a wave of {:.0f} px over the image",
 }
 
 
@@ -169,8 +171,10 @@ def describe(hypothesis: Hypothesis) -> str:
     meaning = {port.name: port.meaning for port in PORTS}
     first = hypothesis.group.terms[0]
     words = _MAPS.get(first.driver, meaning[first.port])
-    if first.driver == "mark":
-        words += ", for each mark by its own amount"
+    if first.driver == "pixels":
+        words = words.format(1.0 / math.hypot(*first.constants))
+    if first.driver in EACH:
+        words += f", for each {first.driver} by its own amount"
     elif first.driver != "one" and first.driver not in _MAPS:
         words += f", varying with {first.driver.replace('_', ' ')}"
     if hypothesis.course.form != "constant":
@@ -192,7 +196,7 @@ def enumerate_hypotheses(scene: Scene) -> tuple[Family, ...]:
         for entry in CATALOGUE
         if entry.entity != "mark"
         for terms in entry.groups
-        if terms[0].driver != "mark"
+        if terms[0].driver not in EACH
     ]
     single, patterned = single_groups(), patterned_groups()
     # Named groups without a pattern follow every course; the others only those that have a name.
@@ -218,6 +222,13 @@ def enumerate_hypotheses(scene: Scene) -> tuple[Family, ...]:
         _family(scene, groups, own, scopes, asked) for groups, own in candidates if groups and own
     )
     return tuple(family for family in families if family.valid.any())
+
+
+def families_of(scene: Scene, groups: list[Group]) -> tuple[Family, ...]:
+    """Families of given groups that never change, for all scopes."""
+    constant, scopes = [Course("constant", "constant")], _scopes(scene)
+    asked = _asked_of_names(constant, {"constant": ("constant",)})
+    return tuple(_family(scene, [group], constant, scopes, asked) for group in groups)
 
 
 def member(family: Family, index: tuple[int, int, int], scene: Scene) -> Hypothesis:
@@ -391,6 +402,9 @@ def _of_each_mark(scene: Scene, constant: list[Course]):
         marks = range(int(first), int(first) + len(target.points))
         ports = [[term.port for term in terms] for terms in signatures]
         yield (
-            [Group(each_mark(*own, marks=marks), "target", target=target.name) for own in ports],
+            [
+                Group(each("mark", *own, numbers=marks), "target", target=target.name)
+                for own in ports
+            ],
             constant,
         )

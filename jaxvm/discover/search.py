@@ -15,8 +15,10 @@ from jaxvm.discover.noise import LONGEST, memory, multipliers
 from jaxvm.discover.ranking import Ranking, noise_of, spread_of_constant, surprise
 from jaxvm.discover.revise import prune, rename
 from jaxvm.discover.rivals import rivals
+from jaxvm.discover.scatter import ALIKE, likeness, of_each_image
 from jaxvm.discover.score import Battery, battery, score_residuals
 from jaxvm.discover.select import Candidate, identity, refit, shortlist, stacked
+from jaxvm.discover.waves import strongest_wave
 from jaxvm.physics.forms import FORMS
 from jaxvm.solve.adjust import Adjustment
 from jaxvm.solve.covariance import effect_deviations
@@ -26,7 +28,10 @@ ALPHA = 0.01
 """Family-wise probability to claim something where nothing is hidden."""
 
 DOUBT = 0.1
-"""Probability that a name is wrong where something significant is left that no name explains."""
+"""Odds against a name where something is left that it should explain: a cautious choice.
+
+It keeps every such name below the 95 % from which a reader may call it sure.
+"""
 
 DOUBTFUL = 0.05
 """Probability of what is left at a finding's own ports from which its course is doubted."""
@@ -77,25 +82,23 @@ class Search:
         """Search until nothing significant is left, at most so many findings are made."""
         for _ in range(3 * most + 1):
             progress(f"scoring hypotheses (round {len(self.findings) + 1})")
-            foremost = self._score()
-            if self.p_value > self.alpha or len(self.findings) == most:
-                break
             leading = [
                 item
-                for item in foremost
+                for item in self._score()
                 if not any(item[0].covered(f.hypothesis) for f in self.findings)
             ]
-            if not leading:
-                self.unproven = "what an unnamed effect left over"
+            if len(self.findings) == most:
                 break
-            number = self.ranking.n
-            progress(f"{number} hypotheses, p = {self.p_value:.3g}: refitting the leading ones")
-            accepted = accept(
-                self.current, leading, self.parts, self.heldout, self.seed, self._hopeless
-            )
-            if isinstance(accepted, str):
-                self.unproven = accepted
-                break
+            accepted = self._accepted(leading, progress)
+            if accepted is None:
+                # What no course explains may be a wave, or differ from image to image.
+                scored = self.p_value
+                leading, self.p_value = self._unscored()
+                accepted = self._accepted(leading, progress)
+                if accepted is None:
+                    self.p_value = min(scored, self.p_value)
+                    break
+            self.unproven = ""
             effect = accepted.chosen.effect
             self._take(accepted, leading)
             progress(f"found: {effect.name} ({effect.scope.words()})")
@@ -127,6 +130,38 @@ class Search:
             residual,
             studentised,
         )
+
+    def _accepted(self, leading, progress: Callable[[str], None]) -> Accepted | None:
+        """The hypothesis that is significant and that the held-out epochs prove."""
+        if self.p_value > self.alpha:
+            return None
+        if not leading:
+            self.unproven = self.unproven or "what an unnamed effect left over"
+            return None
+        number = self.ranking.n
+        progress(f"{number} hypotheses, p = {self.p_value:.3g}: refitting the leading ones")
+        found = accept(self.current, leading, self.parts, self.heldout, self.seed, self._hopeless)
+        if isinstance(found, str):
+            self.unproven = self.unproven or found
+            return None
+        return found
+
+    def _unscored(self):
+        """What is not among the hypotheses that are scored together, as `_score` gives them.
+
+        A wave over an image, or what every image has for itself; and the p-value.
+        """
+        current, variance = self.current, robust_variance(self.current)
+        residual = self.parts.residuals(current)
+        wave, p, drop = strongest_wave(current.scene, residual, self.seed)
+        columns = np.zeros(len(wave.group.terms) * len(FORMS[wave.course.form].bases))
+        leading = [(wave, drop / variance, columns)]
+        if p > self.alpha and likeness(current.scene, residual) > ALIKE:
+            leading, p = of_each_image(current.scene, self._arrangement, variance, self.parts.n)
+        hopeful = [
+            item for item in leading if (identity(item[0]), item[0].course) not in self._hopeless
+        ]
+        return hopeful, p if hopeful else 1.0
 
     def _p_without(self, hypothesis, amplitudes) -> float:
         """The family-wise p-value of the best hypothesis, under what is left when it is fitted.
@@ -266,9 +301,13 @@ class Search:
             deviations = effect_deviations(self.current)[self.given :]
             pairs = zip(self.findings, deviations, strict=True)
             self.findings = [replace(f, stds=f.stds or own) for f, own in pairs]
+        before = self.current
         self.current, self.heldout, self.findings = with_detail(
             self.current, self.heldout, self.findings, parts, self.seed
         )
+        if self.current is not before:
+            self._score()
+            self.unproven = self.unproven if self.p_value <= self.alpha else ""
         self.findings = [self._doubted(finding) for finding in self.findings]
 
     def _doubted(self, finding: Finding) -> Finding:

@@ -69,6 +69,7 @@ class Tables:
                     self.half_size[target],
                     self.checker[point],
                     point.astype(float),
+                    epoch.astype(float),
                     along_beam,
                     velocity,
                 ),

@@ -34,7 +34,7 @@ class Unknowns:
         group_size: unknowns in a local group; smaller groups are filled up.
         label: name of each position of the flat state.
         idle: positions that have an unknown but don't move (spare room for effects).
-        momentary: positions of poses that belong to one epoch only.
+        momentary: positions of poses and amplitudes that belong to one epoch only.
     """
 
     column: Int[np.ndarray, " parameters"]
@@ -61,7 +61,7 @@ class Unknowns:
 
     @property
     def of_one_epoch(self) -> np.ndarray:
-        """True for the entries of x that one epoch alone determines (poses per epoch)."""
+        """True for the entries of x that one epoch alone determines (poses, amplitudes)."""
         mask = np.zeros(self.n + 1, bool)
         mask[self.column[self.momentary]] = True
         return mask[:-1]
@@ -92,7 +92,7 @@ def arrange(
         factor: change of the parameter for a unit change of its unknown.
         label: names.
         idle: positions that are free in form only.
-        momentary: positions of poses of one epoch.
+        momentary: positions of poses and amplitudes of one epoch.
     """
     leads = free & (tie == np.arange(len(free)))
     shared = np.flatnonzero(leads & (group < 0))
@@ -201,7 +201,19 @@ def free_unknowns(scene: Scene) -> Unknowns:
     idle = _release_effects(scene, layout, release, factor)
     group = local_groups(layout, {"epochs": by_epoch, "points": by_point}, free)
     momentary = np.flatnonzero(free & (by_epoch >= 0))
+    momentary = np.append(momentary, layout.all("amplitude")[_amplitudes_of_one_epoch(scene)])
     return arrange(free, group, tie, factor, tuple(label), idle, momentary)
+
+
+def _amplitudes_of_one_epoch(scene: Scene) -> np.ndarray:
+    """Columns of the effects that one epoch has for itself."""
+    own = [
+        column
+        for effect, (columns, _) in zip(scene.effects, scene.places(), strict=True)
+        for k, column in enumerate(range(columns.start, columns.stop))
+        if effect.terms[k // len(FORMS[effect.form].bases)].driver == "epoch"
+    ]
+    return np.array(own, int)
 
 
 def _release_effects(scene: Scene, layout: Layout, release, factor) -> np.ndarray:

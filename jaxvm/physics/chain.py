@@ -41,6 +41,7 @@ class Circumstances(NamedTuple):
     target_half_size: Float[Array, "2"]  # target coordinates, m
     checker: Float[Array, ""]  # +1 and -1 in turn over the marks of a grid; NaN without a grid
     mark: Float[Array, ""]  # number of the mark among those of all targets
+    epoch: Float[Array, ""]  # number of the epoch
     along_beam: Float[Array, ""]  # place of the camera on its station, -1 to 1; NaN without one
     velocity: Float[Array, "6"]  # of the target's origin in the world: m/s and rad/s
 

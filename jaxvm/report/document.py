@@ -26,6 +26,7 @@ def document(diagnosis: Diagnosis) -> dict[str, Any]:
         "left_over": {
             "significant": diagnosis.significant_left,
             "p_value": diagnosis.left_p_value,
+            "likeness": diagnosis.likeness,
             "unproven": diagnosis.unproven,
             "located": [vars(place) for place in diagnosis.located_left],
         },

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxvm.discover.diagnosis import Diagnosis, Finding
+from jaxvm.discover.scatter import ALIKE
 from jaxvm.discover.shape import shape_words
 from jaxvm.physics.drivers import channel_unit
 from jaxvm.physics.effects import Effect
@@ -220,6 +221,12 @@ def verdict_sentence(diagnosis: Diagnosis) -> str:
         found = _count(len(diagnosis.findings))
         return f"{found}; after that none of {tried} is significant (family-wise {p})."
     left = f"Something significant is left ({p})"
+    if diagnosis.likeness > ALIKE:
+        left = (
+            f"What is left moves neighbouring marks of one image alike (correlation "
+            f"{diagnosis.likeness:.2f}), at random from image to image or in a pattern that is "
+            "too fine for the hypotheses: an autofocus, a stabiliser, haze, fringes"
+        )
     if diagnosis.unproven:
         left += (
             f"; its best name, “{diagnosis.unproven}”, does not improve the held-out epochs and is "

@@ -1,5 +1,6 @@
 """What an entry of the catalogue says, and the groups of terms that many entries share."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from jaxvm.physics.effects import Term
@@ -81,18 +82,23 @@ def alternatives(*terms: Term) -> tuple[Terms, ...]:
     return (terms, *((term,) for term in terms))
 
 
-def each_mark(*ports: str, marks: range = range(1)) -> Terms:
-    """Ports that every mark of a target has for itself.
+EACH = ("mark", "epoch")
+"""Observation-like drivers that count what has an amount of its own."""
 
-    The catalogue says what is meant with the first mark; a recording has as many as it has
+
+def each(driver: str, *ports: str, numbers: Sequence[int] = (0,)) -> Terms:
+    """Ports that every mark of a target, or every epoch, has for itself.
+
+    The catalogue says what is meant with the first one; a recording has as many as it has
     (`signature`).
     """
-    own = (Term(port, "mark", "bump", (float(k), 0.25), 1.5) for port in ports for k in marks)
+    own = (Term(port, driver, "bump", (float(k), 0.25), 1.5) for port in ports for k in numbers)
     return tuple(own)
 
 
 def signature(terms: Terms) -> Terms:
     """Terms as the catalogue writes them: of marks that have something each, the first one."""
-    if terms[0].driver != "mark":
+    driver = terms[0].driver
+    if driver not in EACH:
         return terms
-    return each_mark(*dict.fromkeys(term.port for term in terms))
+    return each(driver, *dict.fromkeys(term.port for term in terms))

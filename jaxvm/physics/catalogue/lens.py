@@ -1,6 +1,6 @@
 """Named physics of lenses: principal distance, distortion, decentring, pupil."""
 
-from jaxvm.physics.catalogue.entry import ALWAYS, THERMAL, Entry, Terms, each_mark, pair, plain
+from jaxvm.physics.catalogue.entry import ALWAYS, THERMAL, Entry, Terms, each, pair, plain
 from jaxvm.physics.effects import Term
 
 _FOCAL, _RADIAL = (plain("sensor.focal"),), (plain("lens.k1"),)
@@ -99,6 +99,13 @@ LENS: tuple[Entry, ...] = (
         "principal point with one period.",
     ),
     Entry(
+        "focal-hunts", "the focal length differs from image to image", (48,),
+        (each("epoch", "sensor.focal"),), ALWAYS, ALWAYS, "camera",
+        (1e-5, 2e-2), "motion along the axis", "lock the focus",
+        "The autofocus, or a loose focus ring, takes another place in every image. All targets "
+        "grow or shrink about the principal point, at random from image to image.",
+    ),
+    Entry(
         "focal-wrong", "the focal length is not that of this recording", (94,),
         _FOCAL, ALWAYS, ALWAYS, "camera",
         (1e-4, 5e-2), "scale or distance of the targets", "calibrate in the state of the recording",
@@ -114,7 +121,7 @@ LENS: tuple[Entry, ...] = (
     ),
     Entry(
         "marks-of-other-colour", "the image scale differs from mark to mark", (49,),
-        (each_mark("sensor.focal"),), ALWAYS, ALWAYS, "target",
+        (each("mark", "sensor.focal"),), ALWAYS, ALWAYS, "target",
         (1e-5, 1e-2), "displaced marks", "marks of one colour, a filter, other distances",
         "The lens has another scale for each colour, and the marks are not of one colour. Some "
         "marks are imaged farther from the centre of the image than others beside them.",

@@ -1,6 +1,6 @@
 """Named physics between target and lens: air and windows."""
 
-from jaxvm.physics.catalogue.entry import ALWAYS, THERMAL, Entry, plain
+from jaxvm.physics.catalogue.entry import ALWAYS, THERMAL, Entry, each, plain
 from jaxvm.physics.catalogue.maps import image_map
 
 _AIR = ("constant", "gradient", "temperature", "irradiance")
@@ -23,6 +23,13 @@ MEDIUM: tuple[Entry, ...] = (
         (1e-10, 1e-5), "yaw of the mount", "watch targets at several ranges",
         "A warm wall, a heater or a sunlit side makes the air warmer on one side of the path. "
         "Rays bend away from the warm side, by the square of the distance.",
+    ),
+    Entry(
+        "haze", "the air shimmers", (18, 98),
+        (each("epoch", "medium.bend_u", "medium.bend_v"),), ALWAYS, ALWAYS, "camera",
+        (1e-8, 1e-4), "a stabiliser, vibration of the mount", "record at night; shorten the path",
+        "Turbulence of warm air tilts the rays at random, alike for neighbouring marks of one "
+        "image. It grows with the length of the path and with the sun.",
     ),
     Entry(
         "window", "a plane window stands before the lens", (20,),

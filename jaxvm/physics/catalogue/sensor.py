@@ -1,6 +1,6 @@
 """Named physics of sensors, shutters and clocks."""
 
-from jaxvm.physics.catalogue.entry import ALWAYS, THERMAL, Entry, pair, plain
+from jaxvm.physics.catalogue.entry import ALWAYS, THERMAL, Entry, each, pair, plain
 from jaxvm.physics.catalogue.maps import height_map
 from jaxvm.physics.effects import Term
 
@@ -73,6 +73,13 @@ SENSOR: tuple[Entry, ...] = (
         (5e-2, 20.0), "slip of the mount", "a wide field, a rolled camera",
         "A lens group or the sensor jumped at one moment, as after a knock or a change of the "
         "image window. The whole image shifts.",
+    ),
+    Entry(
+        "image-jumps", "the image shifts at random from image to image", (48,),
+        (each("epoch", "sensor.cx", "sensor.cy"),), ALWAYS, ALWAYS, "camera",
+        (1e-2, 20.0), "vibration of the mount, haze", "switch the stabiliser off",
+        "A stabiliser, or a sensor on springs, rests at another place in every image. The whole "
+        "image shifts, at random from image to image.",
     ),
     Entry(
         "principal-point-ages", "the principal point drifts with age", (51, 85),

@@ -7,7 +7,7 @@ from jaxvm.physics.catalogue.entry import (
     Entry,
     alternatives,
     axes,
-    each_mark,
+    each,
     pair,
     plain,
 )
@@ -110,7 +110,7 @@ TARGET: tuple[Entry, ...] = (
     ),
     Entry(
         "marks-of-other-depth", "the marks stand at different depths", (15,),
-        (each_mark("target.point_z"),), ALWAYS, ALWAYS, "target",
+        (each("mark", "target.point_z"),), ALWAYS, ALWAYS, "target",
         (5e-6, 5e-3), "a bent plate", "view the target from more directions; measure its marks",
         "Marks of another make, thicker or domed, have their optical centre before or behind the "
         "plate. They stand off while the marks beside them don't.",

@@ -1,0 +1,93 @@
+"""What differs from image to image at random: a stabiliser, an autofocus, haze.
+
+No course in time explains it, and random signs of whole epochs leave it as large as it is: it is
+not among the hypotheses that are scored together. It shows in that neighbouring marks of one image
+move alike; then every image gets an amount of its own, judged by chi-square.
+"""
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from jaxvm.discover.cells import Arrangement
+from jaxvm.discover.groups import Group
+from jaxvm.discover.hypotheses import Family, Hypothesis, families_of
+from jaxvm.discover.score import battery, score_residuals
+from jaxvm.discover.select import shortlist
+from jaxvm.network.scene import Scene
+from jaxvm.physics.catalogue import CATALOGUE
+from jaxvm.physics.catalogue.entry import each
+
+ALIKE = 0.15
+"""Correlation of neighbouring marks of one image from which what is left is no noise of marks."""
+
+_MOST = 400
+"""Epochs up to which each can have an amount of its own."""
+
+
+def likeness(scene: Scene, residual: np.ndarray) -> float:
+    """Correlation of the residuals of neighbouring marks in one image; 0 where it may be chance.
+
+    Args:
+        scene: the fitted scene.
+        residual: whitened residuals [observations, 2] in the order of the recording, NaN where not
+            fitted.
+    """
+    obs = scene.recording.observations
+    used = np.flatnonzero(np.isfinite(residual).all(axis=1))
+    if len(used) < 50:
+        return 0.0
+    # A third axis, far longer than the image, keeps images apart.
+    n_targets = len(scene.model.targets)
+    image = (obs.epoch * len(scene.model.cameras) + obs.camera) * n_targets + obs.target
+    at = np.column_stack([obs.pixel[used], 1e6 * image[used]])
+    distance, nearest = (np.asarray(found)[:, 1] for found in KDTree(at).query(at, k=2))
+    pairs = distance < 1e6
+    own, other = residual[used][pairs], residual[used[nearest[pairs]]]
+    # Gross errors and the tails of the noise shall not decide.
+    limit = 4.0 * np.median(np.abs(residual[used])) / 0.67449
+    own, other = np.clip(own, -limit, limit), np.clip(other, -limit, limit)
+    if not own.any():
+        return 0.0
+    value = float(np.mean(own * other) / np.mean(own**2))
+    return value if value > 5.0 / np.sqrt(own.size) else 0.0
+
+
+def of_each_image(
+    scene: Scene, arrangement: Arrangement, variance: float, n: int
+) -> tuple[list[tuple[Hypothesis, float, np.ndarray]], float]:
+    """The leading hypotheses about every image, as `shortlist` gives them, and the p-value.
+
+    Args:
+        scene: the fitted scene.
+        arrangement: its residuals and tangents.
+        variance: of unit weight.
+        n: number of pixel coordinates that are fitted.
+    """
+    n_epochs = len(scene.recording.time)
+    if n_epochs > _MOST:
+        return [], 1.0
+    families = families_of_images(scene)
+    still = np.zeros((n_epochs, 1))
+    ranking = score_residuals(
+        scene, arrangement, battery(scene, arrangement, families), variance, still
+    )
+    leading = shortlist(ranking, scene, variance, n, 12)
+    # Where several cameras err at random, each by an amount of its own, it is no camera but the air
+    # between: noise that no model takes away.
+    lone = {h.scope.camera for h, own, _ in leading if own > 0.0 and len(h.scope.camera) == 1}
+    if len(lone) > 1 and leading[0][0].scope.camera in lone:
+        return [], 1.0
+    return leading, float(min(ranking.n * np.exp(-0.5 * ranking.best_z()), 1.0))
+
+
+def families_of_images(scene: Scene) -> tuple[Family, ...]:
+    """Physics of the catalogue that every image has to an extent of its own."""
+    epochs = range(len(scene.recording.time))
+    signatures = dict.fromkeys(
+        (entry.entity, tuple(term.port for term in terms))
+        for entry in CATALOGUE
+        for terms in entry.groups
+        if terms[0].driver == "epoch"
+    )
+    groups = [Group(each("epoch", *ports, numbers=epochs), entity) for entity, ports in signatures]
+    return families_of(scene, groups)
