@@ -8,7 +8,7 @@ from scipy.special import gammaln
 
 from jaxvm.discover.hypotheses import Family, Hypothesis, member
 from jaxvm.network.scene import Scene
-from jaxvm.physics.effects import Scope
+from jaxvm.physics.effects import Effect, Scope
 
 
 @dataclass(frozen=True)
@@ -76,6 +76,28 @@ class Ranking:
                     p = min(p, float((1 + np.sum(null >= z.max())) / (1 + len(null))))
                     families += 1
         return min(p * max(families, 1), 1.0)
+
+    def left_in_harmonics(self, effect: Effect) -> float:
+        """Probability that noise alone gives what is left at a half and a third of a period.
+
+        A sawtooth, or what goes to and fro by steps, is no oscillation; 1 for other forms.
+        """
+        if effect.form != "periodic":
+            return 1.0
+        ports, p, asked = {term.port for term in effect.terms}, 1.0, 0
+        for scores in self.scores:
+            own = scores.family.by_driver_and_form().get((effect.driver, "periodic"), [])
+            if not own:
+                continue
+            rate = np.array([1.0 / scores.family.courses[k].constants[0] for k in own])
+            near = {own[int(np.argmin(np.abs(rate - n / effect.constants[0])))] for n in (2, 3)}
+            for g, group in enumerate(scores.family.groups):
+                if {term.port for term in group.terms} <= ports:
+                    here = [s == effect.scope for s in scores.family.scopes]
+                    z = scores.z[g][sorted(near)][:, here]
+                    asked += z.size
+                    p = min(p, float(np.exp(-0.5 * z.max(initial=0.0))))
+        return min(p * asked, 1.0)
 
     def p_value(self, z: float) -> float:
         """Probability that noise alone gives a statistic this large anywhere (family-wise)."""

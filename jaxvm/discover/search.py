@@ -313,12 +313,15 @@ class Search:
     def _doubted(self, finding: Finding) -> Finding:
         """A finding's weights where something is left: it may be that of which this is a part.
 
-        What is left need not be significant among all hypotheses; at the finding's own ports it
-        speaks against the course that was named.
+        What is left need not be significant among all hypotheses; at the finding's own ports, or in
+        its harmonics, it speaks against the course that was named. So does the same name for the
+        same body twice.
         """
-        ports = {term.port for term in finding.effect.terms}
-        left = self.ranking.left_at(ports, finding.effect.scope)
-        if self.p_value > self.alpha and left > DOUBTFUL:
+        effect = finding.effect
+        left = self.ranking.left_at({term.port for term in effect.terms}, effect.scope)
+        left = min(left, self.ranking.left_in_harmonics(effect))
+        alike = [f for f in self.findings if identity(f.hypothesis) == identity(finding.hypothesis)]
+        if self.p_value > self.alpha and left > DOUBTFUL and len(alike) == 1:
             return finding
         sure = 1.0 - DOUBT
         others = tuple(replace(r, weight=sure * r.weight) for r in finding.rivals)
