@@ -23,6 +23,9 @@ ALIKE = 0.15
 _MOST = 400
 """Epochs up to which each can have an amount of its own."""
 
+_ALSO = 0.2
+"""Share of the leading evidence from which another camera errs at random, too."""
+
 
 def likeness(scene: Scene, residual: np.ndarray) -> float:
     """Correlation of the residuals of neighbouring marks in one image; 0 where it may be chance.
@@ -74,7 +77,11 @@ def of_each_image(
     leading = shortlist(ranking, scene, variance, n, 12)
     # Where several cameras err at random, each by an amount of its own, it is no camera but the air
     # between: noise that no model takes away.
-    lone = {h.scope.camera for h, own, _ in leading if own > 0.0 and len(h.scope.camera) == 1}
+    lone = {
+        h.scope.camera
+        for h, own, _ in leading
+        if own > _ALSO * leading[0][1] and len(h.scope.camera) == 1
+    }
     if len(lone) > 1 and leading[0][0].scope.camera in lone:
         return [], 1.0
     return leading, float(min(ranking.n * np.exp(-0.5 * ranking.best_z()), 1.0))
