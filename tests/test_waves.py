@@ -17,6 +17,7 @@ from jaxvm.physics.catalogue.entry import each
 from jaxvm.physics.effects import Effect, Scope
 from jaxvm.recording import Camera, Model, Observations, Recording, Station, Target
 from jaxvm.recording.model import grid_names
+from jaxvm.report import summary
 
 IMAGE, SIGMA, N_EPOCHS, SPACING = (1280, 960), 0.05, 30, 60.0
 MARKS = grid_points(7, 9, 0.11) - [0.44, 0.33, 0.0]
@@ -131,3 +132,48 @@ def test_what_each_image_has_for_itself_is_free_in_held_out_epochs(still):
     # Fitted epochs keep what they had; held-out ones find their own.
     z = (np.array(mended.amplitudes) - hunting) / deviation
     assert np.abs(z).max() < 6.0
+
+
+@pytest.fixture(scope="module")
+def pair(still):
+    """Two cameras that stand side by side before the plate."""
+    (camera,) = still.model.cameras
+    beside = replace(camera, name="other", pose=np.array([0.0, -0.08, 0.0, 0.15, 0.0, 0.0]))
+    obs = still.observations
+    both = Observations(
+        np.tile(obs.epoch, 2),
+        np.repeat([0, 1], len(obs.epoch)),
+        *(np.concatenate([own, own]) for own in (obs.target, obs.point, obs.pixel, obs.sigma)),
+    )
+    model = replace(still.model, cameras=(camera, beside))
+    recording = replace(still, model=model, observations=both)
+    scene = build(recording)
+    pixel = np.zeros((len(both.epoch), 2))
+    for rows, own in zip(scene.tables, predict_pixels(scene.state, scene.network), strict=True):
+        pixel[rows] = np.asarray(own)[: len(rows)]
+    return replace(recording, observations=replace(both, pixel=pixel))
+
+
+def test_an_image_that_jumps_is_named_at_its_camera(pair):
+    obs = pair.observations
+    jumps = 0.1 * np.random.default_rng(6).standard_normal((N_EPOCHS, 2))
+    found = diagnose(recorded(pair, jumps[obs.epoch] * (obs.camera == 1)[:, None]))
+    (finding,) = found.findings
+    assert finding.effect.catalogue_id in {"image-jumps", "haze"}
+    names = {finding.effect.catalogue_id}
+    names |= {r.hypothesis.entries[0].id for r in finding.rivals if r.hypothesis.entries}
+    assert "image-jumps" in names
+    assert finding.effect.scope.camera == ("other",)
+    assert found.final.heldout_rms_px == pytest.approx(SIGMA, rel=0.05)
+    assert found.likeness == 0.0
+
+
+def test_what_every_camera_has_for_itself_is_told_and_not_claimed(pair):
+    """Haze: each camera and image shifts by an amount of its own, before a plate that is known."""
+    obs = pair.observations
+    jumps = 0.1 * np.random.default_rng(7).standard_normal((2, N_EPOCHS, 2))
+    known = replace(pair.model, targets=(replace(pair.model.targets[0], free=()),))
+    found = diagnose(replace(recorded(pair, jumps[obs.camera, obs.epoch]), model=known))
+    assert found.verdict == "unexplained" and not found.findings
+    assert found.likeness > ALIKE
+    assert "haze" in summary(found)

@@ -5,12 +5,15 @@ not among the hypotheses that are scored together. It shows in that neighbouring
 move alike; then every image gets an amount of its own, judged by chi-square.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy.spatial import KDTree
 
 from jaxvm.discover.cells import Arrangement
 from jaxvm.discover.groups import Group
 from jaxvm.discover.hypotheses import Family, Hypothesis, families_of
+from jaxvm.discover.ranking import Ranking
 from jaxvm.discover.score import battery, score_residuals
 from jaxvm.discover.select import shortlist
 from jaxvm.network.scene import Scene
@@ -56,35 +59,51 @@ def likeness(scene: Scene, residual: np.ndarray) -> float:
 
 
 def of_each_image(
-    scene: Scene, arrangement: Arrangement, variance: float, n: int
+    scene: Scene,
+    arrangement: Arrangement,
+    variance: float,
+    n: int,
+    without: Callable[[Hypothesis, np.ndarray], np.ndarray | None],
 ) -> tuple[list[tuple[Hypothesis, float, np.ndarray]], float]:
     """The leading hypotheses about every image, as `shortlist` gives them, and the p-value.
+
+    None where several cameras err at random, each by an amount of its own: it is no camera then but
+    the air between, noise that no model takes away.
 
     Args:
         scene: the fitted scene.
         arrangement: its residuals and tangents.
         variance: of unit weight.
         n: number of pixel coordinates that are fitted.
+        without: the whitened residuals that a hypothesis leaves when it is fitted.
     """
     n_epochs = len(scene.recording.time)
     if n_epochs > _MOST:
         return [], 1.0
-    families = families_of_images(scene)
+    asked = battery(scene, arrangement, families_of_images(scene))
     still = np.zeros((n_epochs, 1))
-    ranking = score_residuals(
-        scene, arrangement, battery(scene, arrangement, families), variance, still
-    )
+
+    def ranked(residual: np.ndarray | None = None) -> Ranking:
+        return score_residuals(scene, arrangement, asked, variance, still, residual)
+
+    ranking = ranked()
     leading = shortlist(ranking, scene, variance, n, 12)
-    # Where several cameras err at random, each by an amount of its own, it is no camera but the air
-    # between: noise that no model takes away.
-    lone = {
-        h.scope.camera
-        for h, own, _ in leading
-        if own > _ALSO * leading[0][1] and len(h.scope.camera) == 1
-    }
-    if len(lone) > 1 and leading[0][0].scope.camera in lone:
+    if not leading:
         return [], 1.0
+    first, foremost, amplitudes = leading[0]
+    if len(_single(leading, _ALSO * foremost) - {first.scope.camera}):
+        # Where a target moves freely, one of two cameras may err for the other.
+        left = without(first, amplitudes)
+        again = [] if left is None else shortlist(ranked(left), scene, variance, n, 12)
+        if len(first.scope.camera) == 1 and _single(again, _ALSO * foremost):
+            return [], 1.0
     return leading, float(min(ranking.n * np.exp(-0.5 * ranking.best_z()), 1.0))
+
+
+def _single(leading, least: float) -> set[tuple[str, ...]]:
+    """Single cameras of which at least so much evidence says that they err at random."""
+    cameras = {h.scope.camera for h, evidence, _ in leading if evidence > least}
+    return {own for own in cameras if len(own) == 1}
 
 
 def families_of_images(scene: Scene) -> tuple[Family, ...]:

@@ -157,7 +157,9 @@ class Search:
         columns = np.zeros(len(wave.group.terms) * len(FORMS[wave.course.form].bases))
         leading = [(wave, drop / variance, columns)]
         if p > self.alpha and likeness(current.scene, residual) > ALIKE:
-            leading, p = of_each_image(current.scene, self._arrangement, variance, self.parts.n)
+            leading, p = of_each_image(
+                current.scene, self._arrangement, variance, self.parts.n, self._left_by
+            )
         hopeful = [
             item for item in leading if (identity(item[0]), item[0].course) not in self._hopeless
         ]
@@ -178,6 +180,11 @@ class Search:
             return self.p_value
         variance = robust_variance(without.adjustment)
         return self._scores(variance, self._signs, stacked(without.adjustment)).p_value(z)
+
+    def _left_by(self, hypothesis, amplitudes) -> np.ndarray | None:
+        """Whitened residuals that a hypothesis leaves; None where it can't be fitted."""
+        fitted = refit(self.current, hypothesis, amplitudes, self.parts)
+        return None if fitted is None else stacked(fitted.adjustment)
 
     def _take(self, accepted: Accepted, leading) -> None:
         """Take an accepted hypothesis into the model, and look at the earlier findings again."""
