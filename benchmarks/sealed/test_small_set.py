@@ -2,8 +2,8 @@
 
 The world (benchmarks/sealed/world) is plain numpy, written from the physics. What a recording can
 show is told by the world's own estimate of the part that survives the adjustment ("visible"). The
-full benchmark makes sets of hundreds of all kinds (benchmarks/sealed/make.py); here boards before
-one camera and stereo rigs take turns, for they are the quickest.
+full benchmark makes sets of hundreds of all kinds (benchmarks/sealed/make.py); here are mostly
+boards before one camera and wide-angle lenses, for they are the quickest.
 """
 
 import json
@@ -19,14 +19,11 @@ from jaxvm.recording import read_recording
 from jaxvm.report import document
 
 SEALED = Path(__file__).parent
-SEED = 271828
-KINDS = "board", "stereo"
+SEED = 161803
+KINDS = "board", "wide", "board", "wide", "stereo"
 COUNT, EMPTY = 30, 8
 CLEAR = 150.0
 """Visible chi-square from which the name has to be right in nearly all cases."""
-
-RANDOM = {"focus-breathes", "stabiliser-jumps", "lens-loose-in-thread", "heat-haze", "wet-glass"}
-"""Physics that takes another value in every image: the engine has no form for it yet."""
 
 
 @pytest.fixture(scope="module")
@@ -84,9 +81,7 @@ def test_clear_physics_is_named(diagnosed):
     clear = [
         (truth["hidden"][0], report)
         for truth, report in diagnosed
-        if truth["hidden"]
-        and truth["hidden"][0]["visible"] >= CLEAR
-        and truth["hidden"][0]["effect"] not in RANDOM
+        if truth["hidden"] and truth["hidden"][0]["visible"] >= CLEAR
     ]
     assert len(clear) >= 8
     right = [bool(set(h["rows"]) & _rows_of_set(report)) for h, report in clear]
