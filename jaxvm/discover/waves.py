@@ -61,7 +61,7 @@ def strongest_wave(
         when = (time[obs.epoch[own]] - time[0]) / (span or 1.0)
         at = np.column_stack([obs.pixel[own] / size, when])
         values = residual[own] @ np.array([1.0, 1j])
-        cycles, n = _peak(at, values, span > 0.0)
+        cycles, n = _peak(at, values, obs.epoch[own], span > 0.0)
         tried += n
         z, explained = _surprise(at, residual[own], cycles, obs.epoch[own], signs)
         if z > best[0]:
@@ -84,37 +84,37 @@ def _hypothesis(rates: Float[np.ndarray, "3"], camera: str) -> Hypothesis:
     return Hypothesis(Group(terms, "camera"), course, Scope(camera=(camera,)), ())
 
 
-def _peak(at, values, timed: bool) -> tuple[Float[np.ndarray, "3"], int]:
+def _peak(at, values, epoch, timed: bool) -> tuple[Float[np.ndarray, "3"], int]:
     """Cycles over the image's width, its height, and the recording at the largest power.
 
-    `values` are u + iv: a wave of either component, or of both, has its power at a wave vector or
-    at its opposite.
+    `values` are u + iv; the powers of both components are added.
     """
     grid = np.arange(-SHORTEST, SHORTEST + 1e-9, _STEP)
-    times = np.arange(-_FASTEST, _FASTEST + 1e-9, _STEP) if timed else np.zeros(1)
-    along_x = _wave(at[:, 0], grid)
-    along_y = _wave(at[:, 1], grid[grid >= 0.0])
-    length = np.hypot(grid[:, None], grid[grid >= 0.0])
+    half = grid[grid >= 0.0]  # a wave and its opposite are one
+    length = np.hypot(grid[:, None], half)
     allowed = (length >= LONGEST) & (length <= SHORTEST)
-    best, found = -1.0, np.zeros(3)
-    for rate in times:
-        moved = _wave(at[:, 2], np.array([rate]))
-        power = sum(
-            np.abs((along_x * (part[:, None] * moved)).T @ along_y) ** 2
-            for part in (values.real, values.imag)
-        )
-        power = np.where(allowed, power, -1.0)
-        place = np.unravel_index(int(np.argmax(power)), power.shape)
-        if power[place] > best:
-            best = float(power[place])
-            found = np.array([grid[place[0]], grid[grid >= 0.0][place[1]], rate])
+    rates = np.arange(-_FASTEST, _FASTEST + 1e-9, _STEP) if timed else np.zeros(1)
+    # Within an epoch time stands still: its marks are summed once for all rates.
+    found, first = np.unique(epoch, return_index=True)
+    sums = np.empty((2, len(found), len(grid) * len(half)), complex)
+    for k, own in enumerate(epoch == e for e in found):
+        along_x, along_y = _wave(at[own, 0], grid), _wave(at[own, 1], half)
+        for axis, part in enumerate((values[own].real, values[own].imag)):
+            sums[axis, k] = ((along_x * part[:, None]).T @ along_y).ravel()
+    moved = _wave(at[first, 2], rates)
+    power = sum(np.abs(moved.T @ part) ** 2 for part in sums)
+    power = np.where(allowed.ravel(), power, -1.0)
+    rate, place = np.unravel_index(int(np.argmax(power)), power.shape)
+    x, y = np.unravel_index(place, allowed.shape)
+    start = np.array([grid[x], half[y], rates[rate]])
+    n = int(allowed.sum()) * len(rates)
     if not timed:
-        return _refined(at, values, found, 2), int(allowed.sum())
-    refined = _refined(at, values, found, 3)
+        return _refined(at, values, start, 2), n
+    refined = _refined(at, values, start, 3)
     # A wave that does not run within the recording is a constant one.
     if abs(refined[2]) < _STEP:
         refined = _refined(at, values, np.append(refined[:2], 0.0), 2)
-    return refined, int(allowed.sum()) * len(times)
+    return refined, n
 
 
 def _refined(at, values, start: Float[np.ndarray, "3"], free: int) -> Float[np.ndarray, "3"]:
