@@ -22,26 +22,16 @@ class Expected:
     constant: str = ""
 
 
+# One of each kind; benchmarks/hidden_physics hides all nineteen, over many seeds.
 HIDDEN = {
     "plate-expansion": Expected("target-expansion", (("expansion", 0, 1),), "lag"),
-    "humidity-growth": Expected(
-        "target-growth-anisotropic", (("growth along x", 0, 1), ("growth along y", 1, 1))
-    ),
-    "plate-bow": Expected("target-bow", (("deflection", 0, 1),)),
     "mark-displaced": Expected(
         "mark-displaced", (("displacement x", 0, 1), ("displacement y", 1, 1))
     ),
-    "reference-moved": Expected("target-moved", (("displacement", 0, 1),)),
     "mount-slip": Expected("mount-slip", (("turn", 0, 1),)),
     "mount-creep": Expected("mount-creep", (("turn", 0, 1),), "time constant"),
     "hysteresis": Expected("mount-hysteresis", (("turn", 0, 1),)),
-    "bracket-growth": Expected("bracket-growth", (("growth", 0, 1),)),
-    "focal-drift": Expected("focal-drift", (("growth", 0, 1),)),
-    "principal-point-walk": Expected(
-        "principal-point-walk", (("walk along u", 0, 1), ("walk along v", 1, 1))
-    ),
     "self-heating": Expected("self-heating", (("shift", 0, 1),), "time constant"),
-    "trigger-offset": Expected("trigger-offset", (("delay", 0, 1),)),
     "rolling-shutter": Expected("rolling-shutter", (("time per frame", 0, 1),)),
     # A mark that seems lower (+v) is one whose rays bend towards the ground.
     "air-bending": Expected("air-bending", (("curvature", 0, -1),)),
