@@ -20,7 +20,7 @@ from jaxvm.report import document
 
 SEALED = Path(__file__).parent
 SEED = 161803
-KINDS = "board", "wide"
+KINDS = "board", "wide", "board", "wide", "stereo"
 COUNT, EMPTY = 30, 8
 CLEAR = 150.0
 """Visible chi-square from which the name has to be right in nearly all cases."""
