@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxvm.network.scene import Scene
-from jaxvm.physics.drivers import channel_kind
+from jaxvm.physics.drivers import OWN_BODY, channel_kind
 from jaxvm.physics.effects import Channels, Scope
 
 _FEWEST_EPOCHS = 6
@@ -73,7 +73,13 @@ def courses_of_marks(courses: list[Course], n_marks: int) -> list[Course]:
         [course for course in courses if course.driver == "time" and course.form == form]
         for form in ("step", "onset", "creep", "settling")
     ]
-    warm = [c for c in courses if c.form == "linear" and channel_kind(c.driver) == "temperature"]
+    warm = [
+        course
+        for course in courses
+        if course.form == "linear"
+        and channel_kind(course.driver) == "temperature"
+        and course.driver != OWN_BODY  # a mark belongs to no camera
+    ]
     every = math.ceil(max(n_marks * sum(map(len, slow)) / _MOST_OF_MARKS, 1.0))
     return [courses[0], *warm, *(course for own in slow for course in own[::every])]
 

@@ -272,9 +272,7 @@ def _family(scene: Scene, groups, courses, scopes, named: dict[str, int]) -> Fam
     asked = Counter(kind for kind, _ in distinct)
     group_scope = np.array([[_has(scope, group) for scope in scopes] for group in groups])
     course_scope = np.array([[_follows(s, course.driver) for s in scopes] for course in courses])
-    # A mark belongs to no camera, and is asked with every course.
-    of_mark = np.array([group.mark is not None for group in groups])
-    valid = group_scope[:, None, :] & (course_scope[None] | of_mark[:, None, None])
+    valid = group_scope[:, None, :] & course_scope[None]
     # What nothing in this recording has (a rangefinder, say) is not computed either.
     seen = np.flatnonzero(valid.any(axis=(1, 2)))
     kept = tuple(groups[g] for g in seen)

@@ -28,7 +28,7 @@ ALPHA = 0.01
 """Family-wise probability to claim something where nothing is hidden."""
 
 DOUBT = 0.1
-"""Odds against a name where something is left that it should explain: a cautious choice.
+"""Weight taken from a name where something is left that it should explain: a cautious choice.
 
 It keeps every such name below the 95 % from which a reader may call it sure.
 """
