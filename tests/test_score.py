@@ -8,11 +8,10 @@ import pytest
 from networks import dense_residuals, stereo_recording
 from test_steps import dense
 
-from jaxvm.discover.cells import arrange
 from jaxvm.discover.hypotheses import enumerate_hypotheses, member
 from jaxvm.discover.noise import multipliers
 from jaxvm.discover.ranking import surprise
-from jaxvm.discover.score import battery, score_residuals
+from jaxvm.discover.score import ScoreTests
 from jaxvm.network.residual import residual
 from jaxvm.physics.drivers import OWN_BODY
 from jaxvm.physics.effects import Effect, Scope, Term
@@ -35,10 +34,7 @@ def stereo():
 
 @pytest.fixture(scope="module")
 def ranked(stereo):
-    scene, arrangement = stereo.scene, arrange(stereo)
-    asked = battery(scene, arrangement, enumerate_hypotheses(scene))
-    still = np.zeros((len(scene.recording.time), 1))
-    return score_residuals(scene, arrangement, asked, 1.0, still)
+    return ScoreTests.of(stereo, enumerate_hypotheses(stereo.scene)).score(1.0)
 
 
 def observed(scene, effects) -> np.ndarray:
@@ -99,10 +95,9 @@ def test_own_temperatures_are_those_of_the_cameras(stereo):
 
 
 def test_white_noise_inflates_nothing(stereo):
-    scene, arrangement = stereo.scene, arrange(stereo)
-    asked = battery(scene, arrangement, enumerate_hypotheses(scene))
+    scene = stereo.scene
     signs = multipliers(len(scene.recording.time), 1, 99, 0)
-    found = score_residuals(scene, arrangement, asked, 1.0, signs, studentised=True)
+    found = ScoreTests.of(stereo, enumerate_hypotheses(scene)).score(1.0, signs, studentised=True)
     inflation = np.concatenate([s.inflation[s.valid] for s in found.scores])
     assert np.median(inflation) < 2.0
     # No hypothesis is beyond what the multipliers give: the data are the model and noise.

@@ -15,10 +15,9 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxvm.discover.cells import arrange
 from jaxvm.discover.hypotheses import enumerate_hypotheses
 from jaxvm.discover.noise import multipliers
-from jaxvm.discover.score import battery, score_residuals
+from jaxvm.discover.score import ScoreTests
 from jaxvm.network.scene import build
 from jaxvm.network.start import start
 from jaxvm.recording import read_recording
@@ -46,10 +45,8 @@ def main() -> None:
         seconds = []
         for _ in range(4):
             began = time.perf_counter()
-            arrangement = arrange(fitted)
-            signs = multipliers(len(recording.time), 1, max(flips, 1), 0) * float(flips > 0)
-            own = battery(fitted.scene, arrangement, asked)
-            ranking = score_residuals(fitted.scene, arrangement, own, 1.0, signs)
+            signs = multipliers(len(recording.time), 1, flips, 0) if flips else None
+            ranking = ScoreTests.of(fitted, asked).score(1.0, signs)
             seconds.append(time.perf_counter() - began)
         rows.append(
             {

@@ -17,14 +17,13 @@ import numpy as np
 from names import Facts
 from scipy.spatial.transform import Rotation
 
-from jaxvm.discover.cells import Arrangement, Cells, arrange
+from jaxvm.discover.cells import Arrangement
 from jaxvm.discover.diagnose import ROOM
 from jaxvm.discover.gross import without_gross_errors
 from jaxvm.discover.heldout import Split, hold_out, split
 from jaxvm.discover.hypotheses import enumerate_hypotheses, member
 from jaxvm.discover.ranking import Ranking
-from jaxvm.discover.score import Battery, battery, score_residuals
-from jaxvm.discover.search import FLIPS
+from jaxvm.discover.score import ScoreTests
 from jaxvm.network.residual import whitening
 from jaxvm.network.scene import Scene, build
 from jaxvm.network.start import start
@@ -103,9 +102,8 @@ def shown(recording: Recording, change: Change, each: list[Change], noise: dict)
     variance = robust_variance(base)
     effects: tuple[Power, ...] = ()
     if each:
-        arrangement = arrange(base)
-        asked = battery(base.scene, arrangement, enumerate_hypotheses(base.scene))
-        effects = tuple(_power(base, arrangement, asked, variance, noise, *own) for own in each)
+        tests = ScoreTests.of(base, enumerate_hypotheses(base.scene))
+        effects = tuple(_power(base, tests, variance, noise, *own) for own in each)
     floor = parts.evaluate(base.scene).rms_px
     return Shown(effects, floor, variance, facts_of(base.scene))
 
@@ -129,27 +127,6 @@ def whitened(base: Adjustment, components: int, pixels, ranges) -> np.ndarray:
         n = network.ranges.n_real
         blocks.append(np.asarray(whitening(network.ranges))[:n] * ranges[:, None])
     return np.concatenate([np.pad(b, [(0, 0), (0, components - b.shape[1])]) for b in blocks])
-
-
-def in_cells(arrangement: Arrangement, values: np.ndarray) -> np.ndarray:
-    """A vector [all observations, components] in the shape of the residuals of the cells."""
-    padded = np.concatenate([values, np.zeros((1, arrangement.components))])
-    return padded[arrangement.rows].reshape(arrangement.cells.residual.shape)
-
-
-def projected(cells: Cells, e: np.ndarray) -> np.ndarray:
-    """M e = e - J L^-T (J L^-T)^T e for a vector in cells."""
-    d = cells.n_local
-    half = cells.half[:, :, d:]
-    shared = np.einsum("nr,nrs->s", e, half)
-    absorbed = np.einsum("s,nrs->nr", shared, half)
-    if d:
-        half = cells.half[:, :, :d]
-        own = np.einsum("nr,nrd->dn", e, half)
-        of_group = np.sum(cells.by(cells.group, own), axis=2)
-        back = np.concatenate([of_group, np.zeros((d, 1))], axis=1)[:, cells.group_of]
-        absorbed = absorbed + np.einsum("dn,nrd->nr", back, half)
-    return e - absorbed
 
 
 def by_rows(arrangement: Arrangement, cells: np.ndarray) -> np.ndarray:
@@ -189,24 +166,22 @@ def inflation(scene: Scene, effect: np.ndarray, noise: dict) -> float:
 
 def _power(
     base: Adjustment,
-    arrangement: Arrangement,
-    asked: Battery,
+    tests: ScoreTests,
     variance: float,
     noise: dict,
     pixels: np.ndarray,
     ranges: np.ndarray,
 ) -> Power:
-    scene = base.scene
+    scene, arrangement = base.scene, tests.arrangement
     e = whitened(base, arrangement.components, pixels, ranges)
     full = float(np.sum(e**2))
-    left = by_rows(arrangement, projected(arrangement.cells, in_cells(arrangement, e)))
+    left = by_rows(arrangement, arrangement.cells.projected(arrangement.in_cells(e)))
     square = float(np.sum(left**2))
     n_pixels = sum(map(len, scene.tables))
     # Remembering noise makes effect and gaps count less, by one factor.
     spread = inflation(scene, left[:n_pixels], noise)
     variance = variance * spread
-    still = np.zeros((len(scene.recording.time), FLIPS))
-    alike = score_residuals(scene, arrangement, asked, variance, still, residual=e)
+    alike = tests.score(variance, residual=e)
     drops, evidence = best_by_name(alike, scene, variance, np.log(np.count_nonzero(e)))
     return Power(
         expected_drop=square / variance,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from judge import _sizes, claims, covered, judge
 from names import Facts, same_name, same_place
-from power import facts_of, in_cells, plain_fit, projected, shown, whitened
+from power import facts_of, plain_fit, shown, whitened
 from tally import wilson
 
 from jaxvm.discover.cells import arrange
@@ -37,7 +37,7 @@ def test_projection_against_dense(small):
     base, _ = plain_fit(recording)
     arrangement = arrange(base)
     e = whitened(base, arrangement.components, *change)
-    square = np.sum(projected(arrangement.cells, in_cells(arrangement, e)) ** 2)
+    square = np.sum(arrangement.cells.projected(arrangement.in_cells(e)) ** 2)
 
     problem = base.problem
     jacobian = jax.jacfwd(lambda x: jax.tree.leaves(problem.residual(x)))(base.x)

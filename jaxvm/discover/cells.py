@@ -28,7 +28,8 @@ class Cells:
         half: rows of J L^-T, the local part first.
         group: cells of each local group, padded with the number of cells.
         group_of: local group of each cell; the number of groups where it has none.
-        epoch: cells of each epoch, padded with the number of cells.
+        epoch_of: epoch of each cell.
+        n_epochs: number of epochs.
     """
 
     tangent: Float[np.ndarray, "ports cells rows"]
@@ -36,13 +37,24 @@ class Cells:
     half: Float[np.ndarray, "cells rows halves"]
     group: Int[np.ndarray, "groups width"]
     group_of: Int[np.ndarray, " cells"]
-    epoch: Int[np.ndarray, "epochs wide"]
+    epoch_of: Int[np.ndarray, " cells"]
+    n_epochs: int
     n_local: int
 
-    def by(self, index: Int[np.ndarray, "a b"], values: Float[np.ndarray, "... cells"]):
-        """Values of cells gathered by group or epoch; padding reads zero."""
-        zero = np.zeros((*values.shape[:-1], 1))
-        return np.concatenate([values, zero], axis=-1)[..., index]
+    def projected(self, e: Float[np.ndarray, "cells rows"]) -> Float[np.ndarray, "cells rows"]:
+        """M e = e - J L^-T (J L^-T)^T e: a vector without what the model explains of it."""
+        d = self.n_local
+        absorbed = np.tensordot(self.half[:, :, d:], self.shared_part(e), axes=1)
+        if d:
+            half = self.half[:, :, :d]
+            own = gathered(np.einsum("nr,nrd->dn", e, half), self.group).sum(axis=2)
+            back = np.concatenate([own, np.zeros((d, 1))], axis=1)[:, self.group_of]
+            absorbed = absorbed + np.einsum("dn,nrd->nr", back, half)
+        return e - absorbed
+
+    def shared_part(self, e: Float[np.ndarray, "cells rows"]) -> Float[np.ndarray, " shared"]:
+        """Coordinates of a vector along the shared columns of J L^-T."""
+        return np.tensordot(e, self.half[:, :, self.n_local :], axes=2)
 
 
 @dataclass(frozen=True)
@@ -55,6 +67,21 @@ class Arrangement:
     drivers: np.ndarray  # observation-like drivers of all observations, NaN where they have none
     starts: tuple[int, ...]  # first observation of each table (pixel tables, then ranges)
     components: int
+
+    def in_cells(
+        self, values: Float[np.ndarray, "observations components"]
+    ) -> Float[np.ndarray, "cells rows"]:
+        """A vector over all observations in the shape of the residuals of the cells."""
+        padded = np.concatenate([values, np.zeros((1, self.components))])
+        return padded[self.rows].reshape(self.cells.residual.shape)
+
+
+def gathered(
+    values: Float[np.ndarray, "... n"], index: Int[np.ndarray, "a b"]
+) -> Float[np.ndarray, "... a b"]:
+    """Values gathered by padded lists of positions; padding reads zero."""
+    zero = np.zeros((*values.shape[:-1], 1))
+    return np.concatenate([values, zero], axis=-1)[..., index]
 
 
 def _whitened(problem: Problem, x):
@@ -111,7 +138,7 @@ def arrange(adjustment: Adjustment) -> Arrangement:
             parts.append(np.pad(np.asarray(own)[:n], [*pad, (0, 0)]))
     key = np.concatenate(keys)
     distinct, cell = np.unique(key, axis=0, return_inverse=True)
-    rows = _padded_lists(cell.ravel(), len(distinct), len(key))
+    rows = padded_lists(cell.ravel(), len(distinct), len(key))
 
     def in_cells(parts):
         values = np.concatenate(parts)
@@ -122,9 +149,10 @@ def arrange(adjustment: Adjustment) -> Arrangement:
         tangent=np.moveaxis(in_cells(tangents), 2, 0),
         residual=in_cells(residuals),
         half=in_cells(halves),
-        group=_padded_lists(distinct[:, 0], n_groups, len(distinct)),
+        group=padded_lists(distinct[:, 0], n_groups, len(distinct)),
         group_of=np.where(distinct[:, 0] < 0, n_groups, distinct[:, 0]),
-        epoch=_padded_lists(distinct[:, 1], len(scene.recording.time), len(distinct)),
+        epoch_of=distinct[:, 1],
+        n_epochs=len(scene.recording.time),
         n_local=problem.sizes[2],
     )
     return Arrangement(
@@ -137,7 +165,7 @@ def arrange(adjustment: Adjustment) -> Arrangement:
     )
 
 
-def _padded_lists(label: np.ndarray, n_labels: int, filler: int) -> np.ndarray:
+def padded_lists(label: np.ndarray, n_labels: int, filler: int) -> np.ndarray:
     """Positions of each label 0..n-1 as rows of equal length, filled up with `filler`."""
     kept = np.flatnonzero(label >= 0)
     counts = np.bincount(label[kept], minlength=n_labels)

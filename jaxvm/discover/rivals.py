@@ -11,11 +11,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from jaxvm.discover.cells import Arrangement
 from jaxvm.discover.courses import Course
 from jaxvm.discover.hypotheses import Family, Hypothesis, member
 from jaxvm.discover.ranking import Ranking
-from jaxvm.discover.score import Battery, battery, score_residuals
+from jaxvm.discover.score import ScoreTests
 from jaxvm.discover.select import DECIDED, log_prior, price_of_columns, stacked
 from jaxvm.physics.effects import Effect
 from jaxvm.solve.adjust import Adjustment
@@ -62,8 +61,7 @@ def rivals(
     after: Adjustment,
     own: Hypothesis,
     effect: Effect,
-    arrangement: Arrangement,
-    asked: Battery,
+    tests: ScoreTests,
     n: int,
     shown: Iterable[tuple[Hypothesis, np.ndarray, float]] = (),
 ) -> tuple[Rival, list[Rival]]:
@@ -75,8 +73,7 @@ def rivals(
     Args:
         before, after: the fits without and with the chosen effect.
         own, effect: what was chosen, and its fitted values.
-        arrangement: of the fit without it.
-        asked: all hypotheses.
+        tests: of all hypotheses, at the fit without it.
         n: number of pixel coordinates that are fitted.
         shown: hypotheses that the recording itself shows to be as good, with their amplitudes and
             by how much their evidence is behind.
@@ -98,13 +95,11 @@ def rivals(
             driver = named.course.driver
             claim.of_driver[driver] = max(claim.of_driver.get(driver, -np.inf), float(odds))
 
-    scene, epochs = before.scene, len(before.scene.recording.time)
-    still = np.zeros((epochs, 1))
-    found = []
-    refined = _at(asked.families, effect)
-    for some in (asked, battery(scene, arrangement, refined) if refined else None):
+    scene, found = before.scene, []
+    refined = _at(tests.battery.families, effect)
+    for some in (tests, tests.about(refined) if refined else None):
         if some is not None:
-            alike = score_residuals(scene, arrangement, some, variance, still, residual=change)
+            alike = some.score(variance, residual=change)
             found += list(_resembling(alike, scene, own, full, variance))
     own_price = min((price for h, _, price, _ in found if h.same(own)), default=0.0)
     prices = {_course_of(h): price for h, _, price, _ in reversed(found)}

@@ -10,11 +10,9 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial import KDTree
 
-from jaxvm.discover.cells import Arrangement
 from jaxvm.discover.groups import Group
 from jaxvm.discover.hypotheses import Family, Hypothesis, families_of
-from jaxvm.discover.ranking import Ranking
-from jaxvm.discover.score import battery, score_residuals
+from jaxvm.discover.score import ScoreTests
 from jaxvm.discover.select import shortlist
 from jaxvm.network.scene import Scene
 from jaxvm.physics.catalogue import CATALOGUE
@@ -60,7 +58,7 @@ def likeness(scene: Scene, residual: np.ndarray) -> float:
 
 def of_each_image(
     scene: Scene,
-    arrangement: Arrangement,
+    tests: ScoreTests,
     variance: float,
     n: int,
     without: Callable[[Hypothesis, np.ndarray], np.ndarray | None],
@@ -72,7 +70,7 @@ def of_each_image(
 
     Args:
         scene: the fitted scene.
-        arrangement: its residuals and tangents.
+        tests: score tests at this fit.
         variance: of unit weight.
         n: number of pixel coordinates that are fitted.
         without: the whitened residuals that a hypothesis leaves when it is fitted.
@@ -80,13 +78,8 @@ def of_each_image(
     n_epochs = len(scene.recording.time)
     if n_epochs > _MOST:
         return [], 1.0
-    asked = battery(scene, arrangement, families_of_images(scene))
-    still = np.zeros((n_epochs, 1))
-
-    def ranked(residual: np.ndarray | None = None) -> Ranking:
-        return score_residuals(scene, arrangement, asked, variance, still, residual)
-
-    ranking = ranked()
+    tests = tests.about(families_of_images(scene))
+    ranking = tests.score(variance)
     leading = shortlist(ranking, scene, variance, n, 12)
     if not leading:
         return [], 1.0
@@ -94,7 +87,11 @@ def of_each_image(
     if len(_single(leading, _ALSO * foremost) - {first.scope.camera}):
         # Where a target moves freely, one of two cameras may err for the other.
         left = without(first, amplitudes)
-        again = [] if left is None else shortlist(ranked(left), scene, variance, n, 12)
+        again = (
+            []
+            if left is None
+            else shortlist(tests.score(variance, residual=left), scene, variance, n, 12)
+        )
         if len(first.scope.camera) == 1 and _single(again, _ALSO * foremost):
             return [], 1.0
     return leading, float(min(ranking.n * np.exp(-0.5 * ranking.best_z()), 1.0))

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from jaxvm.discover.accept import Accepted, accept, short
-from jaxvm.discover.cells import Arrangement, arrange
 from jaxvm.discover.detail import with_detail
 from jaxvm.discover.diagnosis import Finding
 from jaxvm.discover.heldout import HeldOut, Split
@@ -16,7 +15,7 @@ from jaxvm.discover.ranking import Ranking, noise_of, spread_of_constant, surpri
 from jaxvm.discover.revise import prune, rename
 from jaxvm.discover.rivals import rivals
 from jaxvm.discover.scatter import ALIKE, likeness, of_each_image
-from jaxvm.discover.score import Battery, battery, score_residuals
+from jaxvm.discover.score import ScoreTests
 from jaxvm.discover.select import Candidate, identity, refit, shortlist, stacked
 from jaxvm.discover.waves import strongest_wave
 from jaxvm.physics.forms import FORMS
@@ -67,16 +66,14 @@ class Search:
     p_value: float = 1.0
     unproven: str = ""
     ranking: Ranking = field(init=False)
-    _arrangement: Arrangement = field(init=False)
-    _asked: Battery = field(init=False)
+    _tests: ScoreTests = field(init=False)
     _signs: np.ndarray = field(init=False)
     _hopeless: set = field(default_factory=set)
 
     def __post_init__(self) -> None:
         self._signs = multipliers(len(self.parts.held), 1, FLIPS, self.seed)
-        self._arrangement = arrange(self.current)
         families = enumerate_hypotheses(self.current.scene)
-        self._asked = battery(self.current.scene, self._arrangement, families)
+        self._tests = ScoreTests.of(self.current, families)
 
     def run(self, most: int, progress: Callable[[str], None]) -> None:
         """Search until nothing significant is left, at most so many findings are made."""
@@ -110,26 +107,13 @@ class Search:
         """Score all hypotheses; the leading ones."""
         current = self.current
         variance = robust_variance(current)
-        self._arrangement = arrange(current)
-        self.ranking = self._scores(variance, self._signs)
+        self._tests = self._tests.at(current)
+        self.ranking = self._tests.score(variance, self._signs)
         foremost = shortlist(self.ranking, current.scene, variance, self.parts.n, 12)
         self.p_value = self.ranking.p_value(self.ranking.best_z())
         if self.p_value > self.alpha and foremost:
             self.p_value = self._p_without(*foremost[0][::2])
         return foremost
-
-    def _scores(
-        self, variance: float, signs: np.ndarray, residual=None, studentised: bool = False
-    ) -> Ranking:
-        return score_residuals(
-            self.current.scene,
-            self._arrangement,
-            self._asked,
-            variance,
-            signs,
-            residual,
-            studentised,
-        )
 
     def _accepted(self, leading, progress: Callable[[str], None]) -> Accepted | None:
         """The hypothesis that is significant and that the held-out epochs prove."""
@@ -158,7 +142,7 @@ class Search:
         leading = [(wave, drop / variance, columns)]
         if p > self.alpha and likeness(current.scene, residual) > ALIKE:
             leading, p = of_each_image(
-                current.scene, self._arrangement, variance, self.parts.n, self._left_by
+                current.scene, self._tests, variance, self.parts.n, self._left_by
             )
         hopeful = [
             item for item in leading if (identity(item[0]), item[0].course) not in self._hopeless
@@ -179,7 +163,7 @@ class Search:
         if without is None:
             return self.p_value
         variance = robust_variance(without.adjustment)
-        return self._scores(variance, self._signs, stacked(without.adjustment)).p_value(z)
+        return self._tests.score(variance, self._signs, stacked(without.adjustment)).p_value(z)
 
     def _left_by(self, hypothesis, amplitudes) -> np.ndarray | None:
         """Whitened residuals that a hypothesis leaves; None where it can't be fitted."""
@@ -210,8 +194,7 @@ class Search:
             chosen.adjustment,
             chosen.hypothesis,
             chosen.effect,
-            self._arrangement,
-            self._asked,
+            self._tests,
             parts.n,
             _as_good(accepted, leading),
         )
@@ -278,7 +261,7 @@ class Search:
         window = min(2 * window, max(int(LONGEST * n_epochs), 2))
         remembering = multipliers(n_epochs, window, FLIPS, self.seed)
         variance = robust_variance(self.current)
-        left = self._scores(variance, remembering, stacked(self.current), studentised=True)
+        left = self._tests.score(variance, remembering, stacked(self.current), studentised=True)
 
         def again(finding: Finding) -> Finding:
             met = noise_of(left, finding.hypothesis, scene) or (1.0, 1.0)
@@ -349,8 +332,7 @@ class Search:
             self.current,
             finding.hypothesis,
             effects[self.given + k],
-            arrange(without),
-            self._asked,
+            self._tests.at(without),
             parts.n,
             shown,
         )
