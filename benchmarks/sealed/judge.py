@@ -197,10 +197,17 @@ def _constant(finding: dict, names: tuple[str, ...]) -> tuple[float, float | Non
 
 
 def _sizes(truth: dict, finding: dict, facts: Facts) -> dict:
-    """Deviations from the true sizes and constants in standard deviations."""
+    """Deviations from the true sizes and constants in standard deviations.
+
+    Only like is compared with like: a double at another place or with another driver has another
+    size. Where the common scale of a target is free, one scale of two stands for their difference.
+    """
     driver, own_driver = truth.get("driver") or "constant", finding.get("driver")
-    if own_driver and not own_driver.removeprefix("time since ").startswith(driver):
+    same_driver = (own_driver or driver).removeprefix("time since ").startswith(driver)
+    if not same_driver or (own_driver and (" - " in own_driver) != (" - " in driver)):
         return {"not_compared": f"other driver: {own_driver}, not {driver}"}
+    if not same_place(truth, finding.get("where") or {}, facts):
+        return {"not_compared": "a double at another place"}
     told, constants = truth.get("constants") or {}, {}
     for name, known in CONSTANTS.items():
         own = _constant(finding, known)
@@ -210,7 +217,7 @@ def _sizes(truth: dict, finding: dict, facts: Facts) -> dict:
         offset = facts.first_s if name == "t0_s" else 0.0
         constants[name] = (own[0] + offset - told[name]) / own[1]
     z = []
-    for port, value in (truth.get("values") or {}).items():
+    for port, value in _shown_values(truth, finding).items():
         true = _in_units_of(finding, value, told)
         z.append(None if true is None else _deviation(port, true, finding, 80 in truth["rows"]))
     words = "not all sizes have one number to compare" if None in z else ""
@@ -219,6 +226,18 @@ def _sizes(truth: dict, finding: dict, facts: Facts) -> dict:
         "z_constants": constants,
         "not_compared": words,
     }
+
+
+def _shown_values(truth: dict, finding: dict) -> dict[str, float]:
+    """True values by port; of two scales of a target their difference where only one was found."""
+    values = dict(truth.get("values") or {})
+    pair = ("target.scale_x", "target.scale_y")
+    told = {p.get("port", p["name"].split(",")[0]) for p in _numbers(finding)}
+    if set(pair) <= set(values) and len(told & set(pair)) == 1:
+        (own,) = told & set(pair)
+        other = pair[0] if own == pair[1] else pair[1]
+        values[own] -= values.pop(other)
+    return values
 
 
 def _in_units_of(finding: dict, value: float, told: dict) -> float | None:
@@ -245,11 +264,13 @@ def _deviation(port: str, true: float, finding: dict, squared: bool) -> float | 
         for p in _numbers(finding)
         if p.get("port", p["name"].split(",")[0]) in ports and p.get("std")
     ]
+    own = [one for one in own if one[2] != "first state"]
     if squared:
         own = [one for one in own if one[2] == "square"]
     if len(own) == 1:
         return (own[0][0] - true) / own[0][1]
-    mixed = {"lag", "slow lag", "linear", "square", "play"} & {one[2] for one in own}
+    courses = {"lag", "slow lag", "linear", "square", "play"} & {one[2] for one in own}
+    mixed = courses and {one[2] for one in own} != {"lag"}
     if not own or mixed or len(own) > 3:
         return None
     value, std = np.array([one[:2] for one in own]).T

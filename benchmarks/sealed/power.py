@@ -17,13 +17,13 @@ import numpy as np
 from names import Facts
 from scipy.spatial.transform import Rotation
 
-from jaxvm.discover.cells import Arrangement
 from jaxvm.discover.diagnose import ROOM
 from jaxvm.discover.gross import without_gross_errors
 from jaxvm.discover.heldout import Split, hold_out, split
 from jaxvm.discover.hypotheses import enumerate_hypotheses, member
 from jaxvm.discover.ranking import Ranking
 from jaxvm.discover.score import ScoreTests
+from jaxvm.discover.select import stacked
 from jaxvm.network.residual import whitening
 from jaxvm.network.scene import Scene, build
 from jaxvm.network.start import start
@@ -103,7 +103,7 @@ def shown(recording: Recording, change: Change, each: list[Change], noise: dict)
     effects: tuple[Power, ...] = ()
     if each:
         tests = ScoreTests.of(base, enumerate_hypotheses(base.scene))
-        effects = tuple(_power(base, tests, variance, noise, *own) for own in each)
+        effects = tuple(_power(base, parts, tests, variance, noise, *own) for own in each)
     floor = parts.evaluate(base.scene).rms_px
     return Shown(effects, floor, variance, facts_of(base.scene))
 
@@ -117,6 +117,31 @@ def plain_fit(recording: Recording) -> tuple[Adjustment, Split]:
     return base, parts
 
 
+def left_over(base: Adjustment, parts: Split, pixels, ranges) -> np.ndarray:
+    """What the plain model leaves of a change when it is fitted to its own prediction plus that.
+
+    Whitened [all observations, components], without noise. An effect that turns the whole scene is
+    absorbed beyond first order, so nothing is linearised here.
+    """
+    scene, residuals, network = base.scene, base.residuals(), base.problem.network
+
+    def unwhitened(factor, values, n: int) -> np.ndarray:
+        scale, values = np.asarray(whitening(factor))[:n], np.asarray(values)[:n]
+        return np.divide(values, scale, out=np.zeros_like(values), where=scale > 0.0)
+
+    obs, own = scene.recording.observations, scene.recording.ranges
+    pixel = obs.pixel + pixels
+    for factor, rows, left in zip(network.pixels, scene.tables, residuals.pixels, strict=True):
+        pixel[rows] += unwhitened(factor, left, len(rows))
+    changed = {"observations": _with(obs, pixel=pixel)}
+    if own is not None:
+        left = unwhitened(network.ranges, residuals.ranges, len(own.distance))
+        changed["ranges"] = _with(own, distance=own.distance + left.ravel() + ranges)
+    plain = start(build(_with(scene.recording, **changed), ()))
+    plain = plain.with_effects(scene.recording.model.effects, ROOM)
+    return stacked(parts.fit(plain))
+
+
 def whitened(base: Adjustment, components: int, pixels, ranges) -> np.ndarray:
     """A change of pixels (px) and ranges (m) like the residuals: [all observations, components]."""
     scene, blocks = base.scene, []
@@ -127,13 +152,6 @@ def whitened(base: Adjustment, components: int, pixels, ranges) -> np.ndarray:
         n = network.ranges.n_real
         blocks.append(np.asarray(whitening(network.ranges))[:n] * ranges[:, None])
     return np.concatenate([np.pad(b, [(0, 0), (0, components - b.shape[1])]) for b in blocks])
-
-
-def by_rows(arrangement: Arrangement, cells: np.ndarray) -> np.ndarray:
-    """A vector in cells as [all observations, components]."""
-    values = np.zeros((len(arrangement.drivers) + 1, arrangement.components))
-    values[arrangement.rows] = cells.reshape(*arrangement.rows.shape, arrangement.components)
-    return values[:-1]
 
 
 def inflation(scene: Scene, effect: np.ndarray, noise: dict) -> float:
@@ -166,23 +184,23 @@ def inflation(scene: Scene, effect: np.ndarray, noise: dict) -> float:
 
 def _power(
     base: Adjustment,
+    parts: Split,
     tests: ScoreTests,
     variance: float,
     noise: dict,
     pixels: np.ndarray,
     ranges: np.ndarray,
 ) -> Power:
-    scene, arrangement = base.scene, tests.arrangement
-    e = whitened(base, arrangement.components, pixels, ranges)
-    full = float(np.sum(e**2))
-    left = by_rows(arrangement, arrangement.cells.projected(arrangement.in_cells(e)))
+    scene = base.scene
+    full = float(np.sum(whitened(base, tests.arrangement.components, pixels, ranges) ** 2))
+    left = left_over(base, parts, pixels, ranges)
     square = float(np.sum(left**2))
     n_pixels = sum(map(len, scene.tables))
     # Remembering noise makes effect and gaps count less, by one factor.
     spread = inflation(scene, left[:n_pixels], noise)
     variance = variance * spread
-    alike = tests.score(variance, residual=e)
-    drops, evidence = best_by_name(alike, scene, variance, np.log(np.count_nonzero(e)))
+    alike = tests.score(variance, residual=left)
+    drops, evidence = best_by_name(alike, scene, variance, np.log(np.count_nonzero(left)))
     return Power(
         expected_drop=square / variance,
         seen=square / full if full > 0.0 else 0.0,

@@ -203,3 +203,19 @@ def test_sizes_of_vectors_and_waves():
     assert deviation("mount.turn_z", 2.0, turn, {"station": ["s"]}) == [pytest.approx(-2.0)]
     lags = [{**wave[0], "name": "mount.turn_x, lag"}, {**wave[1], "name": "mount.turn_x, slow lag"}]
     assert deviation("mount.turn_x", 1.0, lags) == []
+
+
+def test_only_like_sizes_are_compared():
+    size = {"port": "target.scale_y", "name": "target.scale_y", "value": -2.1e-4, "std": 1e-5}
+    truth = {
+        "rows": [4], "driver": "constant", "where": {"target": ["plate"]},
+        "values": {"target.scale_x": 1e-4, "target.scale_y": -1e-4},
+    }  # fmt: skip
+    finding = {"driver": "constant", "where": {"target": ["plate"]}, "parameters": [size]}
+    # One scale alone is that of a free common scale: it stands for the difference.
+    assert _sizes(truth, finding, FACTS)["z"] == [pytest.approx(-1.0)]
+    elsewhere = {**finding, "where": {"target": ["body"]}}
+    assert "another place" in _sizes(truth, elsewhere, FACTS)["not_compared"]
+    other = {**finding, "driver": "body_a_degC - ambient_degC"}
+    warm = {**truth, "driver": "body_a_degC"}
+    assert "other driver" in _sizes(warm, other, FACTS)["not_compared"]
