@@ -111,6 +111,8 @@ ALIKE = (
     {"radial-beyond-model", "coma"},
     # A wedge or a dome bends the image as a decentred lens does.
     {"decentring", "window-off-centre"},
+    # A dome beside the axis acts as a weak lens off the axis, as stale intrinsics do.
+    {"focal-wrong", "window-off-centre"},
     # The sun bends what carries the camera, mount or beam; it changes the lens or its window.
     {"camera-on-bent-beam", "mount-turn-sun"},
     {"window-lens-power", "focal-sun"},

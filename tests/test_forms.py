@@ -214,6 +214,7 @@ EXPECTED = {  # with the constants 2 and 0.5, written without the package
     "turned": X * np.cos(np.pi * T),
     "turned aside": X * np.sin(np.pi * T),
     "aged": X * np.array([0, 1 / 6, 1 / 2, 2 / 3, 1, 2]),  # hours
+    "first state": np.exp(-(T - T[0]) / 2),
     "decay": np.exp(-np.maximum(X, 0.0) / 2),
     "slow decay": np.exp(-np.maximum(X, 0.0) / 0.5),
     "staircase": np.array([-3, -1, 1, 1, 1, 5]),  # steps of 2, half a step off zero
@@ -237,6 +238,19 @@ def test_two_lags_read_their_own_constants():
     np.testing.assert_allclose(ahead, X - lag(X, T, 800.0), rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(BASES["lag"](X, T, constants), lag(X, T, 800.0), rtol=1e-13)
     np.testing.assert_allclose(BASES["slow lag"](X, T, constants), lag(X, T, 4000.0), rtol=1e-13)
+
+
+def test_a_lag_that_began_earlier_is_a_lag_with_a_state_of_its_own():
+    rng = np.random.default_rng(8)
+    time = np.cumsum(rng.uniform(5.0, 60.0, 400))
+    driver = np.cumsum(rng.normal(size=400))
+    constants = jnp.array([700.0, 1.0])
+    whole = lag(driver, time, 700.0)[150:]
+    later = BASES["lag"](jnp.asarray(driver[150:]), jnp.asarray(time[150:]), constants)
+    state = BASES["first state"](jnp.asarray(driver[150:]), jnp.asarray(time[150:]), constants)
+    expected = later + (whole[0] - driver[150]) * state
+    assert abs(whole[0] - driver[150]) > 1.0
+    np.testing.assert_allclose(whole, expected, rtol=0, atol=1e-10)
 
 
 def test_every_basis_is_checked_here():

@@ -34,18 +34,21 @@ class Course:
 
 
 def driver_kind(scene: Scene, driver: str) -> str:
-    """Kind of a time-like driver: "constant", "quantity", "difference", "own", "time" or
-    "power-on".
+    """Kind of a time-like driver: "constant", "quantity", "difference", "own", "time", "power-on".
+
+    Time is "time or power-on" where nobody noted when the cameras were switched on.
     """
     channels = scene.network.channels
     kind = channels.kinds[channels.index(driver)]
+    if kind == "time" and "power-on" not in channels.kinds:
+        return "time or power-on"
     return "time" if kind == "order" else kind
 
 
 def kinds_in_scope(kind: str, driver: str, scope: Scope) -> tuple[str, ...]:
     """Kinds of a driver for the bodies of a scope, general ones first."""
     if kind not in ("quantity", "difference", "own"):
-        return (kind,)
+        return tuple(kind.split(" or "))
     own = channel_kind(driver)
     body = driver.split(" - ")[0].removeprefix("body_").removesuffix("_degC")
     if driver.startswith("body_") and len(scope.camera) == 1 and body not in scope.camera:
@@ -96,12 +99,17 @@ def _of_quantity(driver: str, channels: Channels, lags: list[float]) -> list[Cou
     return [
         Course(driver, "linear", (), reference),
         Course(driver, "quadratic", (), reference),
-        *(Course(driver, "lag", (tau,), reference) for tau in lags),
+        *(
+            Course(driver, form, (tau,), reference)
+            for form in ("lag", "lag with state")
+            for tau in lags
+        ),
         Course(driver, "two lags", (lags[1], lags[4]), reference),
         Course(driver, "proportional"),
         Course(driver, "square"),
         Course(driver, "rate"),
         *(Course(driver, "transient", (tau,)) for tau in lags[:4]),
+        *(Course(driver, "transient with state", (tau,)) for tau in lags),
         *(
             Course(driver, "direction", (share * rate + 1e-12, tau))
             for share in (0.1, 0.7)

@@ -81,11 +81,12 @@ def patterned_groups() -> list[Group]:
 def marks_of(scene: Scene) -> list[Group]:
     """Each mark that sits wrongly, of targets whose marks are not free."""
     groups = []
-    terms = next(entry for entry in CATALOGUE if entry.entity == "mark").groups[0]
+    alternatives = next(entry for entry in CATALOGUE if entry.entity == "mark").groups
     for t, target in enumerate(scene.model.targets):
         if "points" in target.free:
             continue
-        groups += [Group(terms, "mark", (t, p)) for p in range(len(target.point_names))]
+        marks = range(len(target.point_names))
+        groups += [Group(terms, "mark", (t, p)) for terms in alternatives for p in marks]
     return groups
 
 

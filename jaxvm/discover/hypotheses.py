@@ -10,6 +10,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxvm.discover.courses import (
     Course,
@@ -40,6 +41,8 @@ from jaxvm.physics.ports import PORTS
 NAMED_ONLY = (
     "affine",
     "affine lag",
+    "lag with state",
+    "transient with state",
     "parabola",
     "turning",
     "square",
@@ -101,6 +104,37 @@ class Family:
             found = np.argwhere(np.isfinite(own.max(axis=1)))
             best += [(int(g), places[at[g, s]], int(s)) for g, s in found]
         return best
+
+    def at_peaks(self, values: np.ndarray) -> np.ndarray:
+        """Values [groups, courses, scopes] with those at the best constant raised to the peak.
+
+        The grid of a time constant is coarse: between its points the largest value is that of the
+        parabola through the best point and its neighbours, over the log of the constant. Courses
+        with no refined constant, or with several, are left as they are.
+        """
+        raised = values.copy()
+        for (_, form), places in self.by_driver_and_form().items():
+            constants = FORMS[form].constants
+            if len(constants) != 1 or not constants[0].refined or len(places) < 3:
+                continue
+            x = np.log([self.courses[place].constants[0] for place in places])
+            if (np.diff(x) <= 0.0).any():
+                continue
+            own = values[:, places]
+            at = np.argmax(own, axis=1)
+            g, s = np.nonzero((at > 0) & (at < len(places) - 1) & np.isfinite(own).all(axis=1))
+            k = at[g, s]
+            near = k + np.array([[-1], [0], [1]])
+            raised[g, np.array(places)[k], s] = _peak(x[near], own[g, near, s])
+        return raised
+
+
+def _peak(x: Float[np.ndarray, "3 n"], y: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, " n"]:
+    """Largest values of parabolas through three points, of which the middle one is highest."""
+    left, right = (y[1] - y[0]) / (x[1] - x[0]), (y[2] - y[1]) / (x[2] - x[1])
+    curvature = np.minimum((right - left) / (0.5 * (x[2] - x[0])), -1e-300)
+    slope = (left * (x[2] - x[1]) + right * (x[1] - x[0])) / (x[2] - x[0])
+    return y[1] - np.where(slope == 0.0, 0.0, 0.5 * slope**2 / curvature)
 
 
 @dataclass(frozen=True)
@@ -207,13 +241,14 @@ def enumerate_hypotheses(scene: Scene) -> tuple[Family, ...]:
     by_bases = {n: [c for c in common if len(FORMS[c.form].bases) == n] for n in (1, 2)}
     constant = [Course("constant", "constant")]
     marks = marks_of(scene)
+    of_marks = courses_of_marks(courses, len({group.mark for group in marks}))
     candidates = [
         (single, by_bases[1]),
         (single, by_bases[2]),
         (patterned, constant),
         *((_of_size(moving, size), by_bases[n]) for size in (1, 2, 3) for n in (1, 2)),
         *_as_named(every_named, courses, kinds, listed),
-        (marks, courses_of_marks(courses, len(marks))),
+        *((_of_size(marks, size), of_marks) for size in (1, 2, 3)),
         *_free_forms(scene, constant),
         *_of_each_mark(scene, constant),
     ]

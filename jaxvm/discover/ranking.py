@@ -125,11 +125,13 @@ def top(ranking: Ranking, scene: Scene, count: int) -> list[tuple[Hypothesis, fl
     entries = []
     for scores in ranking.scores:
         z = np.where(scores.valid, scores.z, -np.inf)
-        entries += [(z[index], scores, index) for index in scores.family.with_best_constants(z)]
+        drop = scores.family.at_peaks(np.where(scores.valid, scores.drop, -np.inf))
+        best = scores.family.with_best_constants(z)
+        entries += [(z[index], scores, drop, index) for index in best]
     entries.sort(key=lambda entry: -entry[0])
     return [
-        (member(s.family, index, scene), float(s.drop[index]), s.amplitude[index])
-        for _, s, index in entries[:count]
+        (member(s.family, index, scene), float(drop[index]), s.amplitude[index])
+        for _, s, drop, index in entries[:count]
     ]
 
 

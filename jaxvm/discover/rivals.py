@@ -163,7 +163,8 @@ def _resembling(ranking: Ranking, scene, own: Hypothesis, full: float, variance:
     """
     for scores in ranking.scores:
         family = scores.family
-        drops = np.where(scores.valid, scores.drop, -np.inf) / variance
+        on_grid = np.where(scores.valid, scores.drop, -np.inf) / variance
+        drops = np.minimum(family.at_peaks(on_grid), full)
         for kind, places in family.by_driver_and_form().items():
             best = drops[:, places].max(axis=1)
             mine = (own.course.driver, own.course.form) == kind

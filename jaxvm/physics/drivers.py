@@ -35,8 +35,7 @@ OBSERVATION_DRIVERS: dict[str, str] = {
     "range": "m",
     "inverse_range": "1/m",
     "incidence": "rad",
-    "incidence_u": "1",
-    "incidence_v": "1",
+    "facing": "1/m",
     "motion_u": "px/s",
     "motion_v": "px/s",
     "target_x": "half width",
@@ -117,8 +116,9 @@ def observation_drivers(
 
     `image_x`, `image_y` and `radius` count from the principal point in half image diagonals;
     `row` and `column` from the middle of the image; `incidence` is the angle between the line of
-    sight and the target's normal, `incidence_u, _v` the image direction into which the normal
-    leans times sin i cos i (the pattern of the eccentricity of circular marks); `checker` is +1 and
+    sight and the target's normal, `facing` its cosine over the distance, positive where the
+    target's z axis points away (a disc of radius R is seen where a point R^2 cos i / d behind it
+    would be, which is the eccentricity of circular marks to second order); `checker` is +1 and
     -1 in turn over the marks of a grid, NaN without one; `mark` is the number of the mark among all
     targets', `epoch` that of the epoch; `along_beam` goes from -1 to 1 over a station's cameras.
     """
@@ -133,7 +133,6 @@ def observation_drivers(
     ray = mark_cam / distance
     normal = camera_from_world.rotation @ world_from_target.rotation[:, 2]
     cosine = normal @ ray
-    lean = (normal - cosine * ray)[:2]
     up_cam = camera_from_world.rotation @ up
     up_target = world_from_target.rotation.T @ up
 
@@ -158,8 +157,7 @@ def observation_drivers(
             distance,
             1.0 / distance,
             jnp.arccos(jnp.clip(jnp.abs(cosine), 0.0, 1.0)),
-            lean[0] * cosine,
-            lean[1] * cosine,
+            cosine / distance,
             motion[0],
             motion[1],
             in_target[0],

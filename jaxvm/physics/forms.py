@@ -83,6 +83,7 @@ BASES: dict[str, Callable[[Course, Course, Constants], Course]] = {
     "sixth": lambda x, t, c: x**6,
     "lag": lambda x, t, c: first_order_lag(x, t, c[0]),
     "slow lag": lambda x, t, c: first_order_lag(x, t, c[1]),
+    "first state": lambda x, t, c: jnp.exp(-(t - t[0]) / c[0]),
     "rate": lambda x, t, c: rate(x, t),
     "aged": lambda x, t, c: x * (t - t[0]) / 3600.0,
     "direction": lambda x, t, c: jnp.tanh(rate(first_order_lag(x, t, c[1]), t) / c[0]),
@@ -195,6 +196,13 @@ FORMS: dict[str, Form] = {
         Form("quadratic", ("linear", "square"), (), "as a parabola of {driver}", centred=True),
         Form("lag", ("lag",), (_TAU,), "following {driver} with a lag", centred=True),
         Form(
+            "lag with state",
+            ("lag", "first state"),
+            (_TAU,),
+            "following {driver} with a lag, from a state of its own at first",
+            centred=True,
+        ),
+        Form(
             "two lags",
             ("lag", "slow lag"),
             (_TAU, Constant("slow time constant", "s")),
@@ -216,6 +224,12 @@ FORMS: dict[str, Form] = {
             ("transient",),
             (_TAU,),
             "as far as {driver} is ahead of its own lag",
+        ),
+        Form(
+            "transient with state",
+            ("transient", "first state"),
+            (_TAU,),
+            "as far as {driver} is ahead of its own lag, from a state of its own at first",
         ),
         Form(
             "direction",

@@ -39,5 +39,5 @@ def entries_for(
         for entry in CATALOGUE
         if terms in entry.groups and entity == entry.entity and entry.takes(driver_kinds, form)
     ]
-    special = driver_kinds[1:] or driver_kinds
+    special = [kind for kind in driver_kinds if kind != "quantity"] or driver_kinds
     return tuple([e for e in known if any(kind in e.drivers for kind in special)] or known)

@@ -67,11 +67,11 @@ DETECTION: tuple[Entry, ...] = (
     ),
     Entry(
         "mark-eccentricity", "ellipse centres are taken for mark centres", (65,),
-        (tuple(Term(f"detect.{a}", f"incidence_{a}", "linear") for a in "uv"),),
-        ALWAYS, ALWAYS, "camera",
-        (5e-3, 5.0), "displaced marks", "marks of two sizes",
-        "The centre of a circle's image is not the image of its centre. The error points along "
-        "the tilt of the target and grows with the square of the mark's size.",
+        ((Term("target.point_z", "facing", "linear"),),), ALWAYS, ALWAYS, "target",
+        (1e-7, 1e-2), "marks that have a depth", "marks of two sizes",
+        "The centre of a circle's image is not the image of its centre: it is seen as if the mark "
+        "stood R² cos i / d behind the plate (radius R, incidence i, distance d). The error points "
+        "along the tilt of the target and grows with the square of the mark's size.",
     ),
 )  # fmt: skip
 """Named physics of detection."""

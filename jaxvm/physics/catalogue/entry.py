@@ -48,8 +48,11 @@ class Entry:
         return form in self.forms and any(kind in self.drivers for kind in kinds)
 
 
-THERMAL = ("linear", "lag", "two lags", "affine", "affine lag")
+THERMAL = ("linear", "lag", "lag with state", "two lags", "affine", "affine lag")
 """Forms of what follows a quantity, at once or late."""
+
+CHANGING = ("rate", "transient", "transient with state")
+"""Forms of what follows the rate of a quantity, at once or late."""
 
 SETTLING = ("linear", "proportional", "onset", "creep", "ramp", "settling")
 """Forms of what moves slowly one way."""

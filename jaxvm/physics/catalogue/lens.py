@@ -5,6 +5,7 @@ from jaxvm.physics.effects import Term
 
 _FOCAL, _RADIAL = (plain("sensor.focal"),), (plain("lens.k1"),)
 _DECENTRING = pair("lens.p1", "lens.p2")
+_INTRINSICS = plain("sensor.focal", "sensor.cx", "sensor.cy")
 
 
 def _rings(count: int) -> Terms:
@@ -79,7 +80,7 @@ LENS: tuple[Entry, ...] = (
     ),
     Entry(
         "focal-warm-up", "the focal length settles after power-on", (52,),
-        _FOCAL, ("power-on", "time"), ("onset",), "camera",
+        _FOCAL, ("power-on",), ("onset",), "camera",
         (1e-5, 1e-2), "ambient temperature", "switch off and on again",
         "The camera heats itself after power-on and its principal distance settles. It starts "
         "again with every power-on.",
@@ -107,7 +108,7 @@ LENS: tuple[Entry, ...] = (
     ),
     Entry(
         "focal-wrong", "the focal length is not that of this recording", (94,),
-        _FOCAL, ALWAYS, ALWAYS, "camera",
+        (*_FOCAL, _INTRINSICS), ALWAYS, ALWAYS, "camera",
         (1e-4, 5e-2), "scale or distance of the targets", "calibrate in the state of the recording",
         "The principal distance that was given belongs to another focus, temperature, medium or "
         "device. All targets are too large or too small about the principal point, always.",
@@ -185,7 +186,7 @@ LENS: tuple[Entry, ...] = (
     ),
     Entry(
         "window-off-centre", "a dome or a wedged window stands off the axis", (21,),
-        _DECENTRING, ALWAYS, ALWAYS, "camera",
+        (*_DECENTRING, _INTRINSICS), ALWAYS, ALWAYS, "camera",
         (1e-6, 1e-2), "decentring of the lens", "take the window away, or turn it",
         "The camera does not sit in the middle of its dome, or its window is a wedge. The image is "
         "bent to one side, like that of a lens whose elements do not share one axis.",

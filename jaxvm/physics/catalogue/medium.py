@@ -1,10 +1,10 @@
 """Named physics between target and lens: air and windows."""
 
-from jaxvm.physics.catalogue.entry import ALWAYS, THERMAL, Entry, each, plain
+from jaxvm.physics.catalogue.entry import ALWAYS, CHANGING, THERMAL, Entry, each, plain
 from jaxvm.physics.catalogue.maps import image_map
 
 _AIR = ("constant", "gradient", "temperature", "irradiance")
-_AIR_FORMS = ("constant", "linear", "proportional", "lag")
+_AIR_FORMS = ("constant", "linear", "proportional", "lag", "lag with state")
 _OFF_CENTRE = (plain("sensor.focal"), plain("sensor.focal", "sensor.cx", "sensor.cy"))
 """A weak lens, on the axis of the camera or beside it."""
 
@@ -61,7 +61,7 @@ MEDIUM: tuple[Entry, ...] = (
     ),
     Entry(
         "window-heats", "the window is a lens while it warms", (22,),
-        _OFF_CENTRE, ("temperature",), ("rate", "transient"), "camera",
+        _OFF_CENTRE, ("temperature",), CHANGING, "camera",
         (1e-6, 5e-4), "thermal drift of the focal length", "hold the temperature: it goes away",
         "While the temperature changes, middle and edge of the window or of the lens are not "
         "equally warm. The glass is a weak lens in proportion to the rate.",

@@ -1,6 +1,6 @@
 """Named physics of mounts and stations: what carries the cameras."""
 
-from jaxvm.physics.catalogue.entry import ALWAYS, SETTLING, THERMAL, Entry, axes
+from jaxvm.physics.catalogue.entry import ALWAYS, CHANGING, SETTLING, THERMAL, Entry, axes
 from jaxvm.physics.effects import Term
 
 _TURN, _SHIFT = axes("mount.turn"), axes("mount.shift")
@@ -44,7 +44,7 @@ MOUNT: tuple[Entry, ...] = (
     ),
     Entry(
         "beam-warms-unevenly", "the beam under the camera bends while it warms", (27,),
-        _TURN, ("temperature",), ("rate", "direction", "transient"), "camera",
+        _TURN, ("temperature",), (*CHANGING, "direction"), "camera",
         (1e-7, 1e-3), "backlash of the mount", "hold the temperature: the turn goes away",
         "While the temperature changes, surface and core or the two sides of the beam differ, and "
         "it bends. The turn follows the rate of the temperature and changes sign with it.",
@@ -52,7 +52,7 @@ MOUNT: tuple[Entry, ...] = (
     Entry(
         "station-beam-bends", "the beam between the cameras of a station bends", (27,),
         _OPPOSED, ("irradiance", "gradient", "temperature"),
-        (*THERMAL, "rate", "direction", "transient"), "station",
+        (*THERMAL, *CHANGING, "direction"), "station",
         (1e-9, 1e-3), "turn of one mount", "log both sides of the beam",
         "One side of the beam that carries the cameras is warmer than the other, and it bends. The "
         "cameras at its ends turn against each other, those in its middle do not.",

@@ -161,6 +161,14 @@ SENSOR: tuple[Entry, ...] = (
         "The camera's clock gains or loses. The delay of its exposures grows with time.",
     ),
     Entry(
+        "clock-drift-heat", "the camera's clock follows the temperature", (61,),
+        _DELAY, ("temperature",), ("linear", "lag", "lag with state"), "camera",
+        (1e-7, 1e-2), "an interface that the processor's heat slows down",
+        "a clock that all cameras share",
+        "The oscillator or the electronics of the trigger change with temperature. The delay of "
+        "the exposures follows the camera's own temperature.",
+    ),
+    Entry(
         "frame-slip", "the camera lost a frame", (60,),
         _DELAY, ("time",), ("step",), "camera",
         (1e-3, 1.0), "a single bad image", "number the frames in the device",

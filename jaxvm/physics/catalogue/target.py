@@ -2,6 +2,7 @@
 
 from jaxvm.physics.catalogue.entry import (
     ALWAYS,
+    CHANGING,
     SETTLING,
     THERMAL,
     Entry,
@@ -13,7 +14,11 @@ from jaxvm.physics.catalogue.entry import (
 )
 from jaxvm.physics.effects import Term
 
-_MARK = (plain("target.point_x", "target.point_y"),)
+_MARK = (
+    plain("target.point_x", "target.point_y", "target.point_z"),
+    plain("target.point_x", "target.point_y"),
+    plain("target.point_z"),
+)
 _PLACE = axes("structure.shift", "structure.turn")
 
 TARGET: tuple[Entry, ...] = (
@@ -53,7 +58,7 @@ TARGET: tuple[Entry, ...] = (
         "target-bends", "the target bends with its surroundings", (7,),
         pair("target.bow_x", "target.bow_y"),
         ("temperature", "humidity", "irradiance", "quantity"),
-        (*THERMAL, "rate", "transient", "hysteresis"), "target",
+        (*THERMAL, *CHANGING, "hysteresis"), "target",
         (1e-8, 1e-3), "drift of the lens distortion", "watch a second target",
         "One-sided warming or moisture bends the plate. The bow follows the driver, often late.",
     ),
@@ -81,7 +86,7 @@ TARGET: tuple[Entry, ...] = (
     ),
     Entry(
         "target-scale-lags", "the target's scale follows the rate of the temperature", (97,),
-        (plain("target.scale"),), ("temperature",), ("rate", "transient"), "target",
+        (plain("target.scale"),), ("temperature",), CHANGING, "target",
         (1e-7, 1e-4), "thermal expansion, drift of the focal length",
         "a sensor on the target itself",
         "The logged temperature is not that of the plate or of the scale bar, which warm up later. "
@@ -96,7 +101,7 @@ TARGET: tuple[Entry, ...] = (
     ),
     Entry(
         "target-print", "the target's x and y scales differ", (4,),
-        pair("target.scale_x", "target.scale_y")[1:], ALWAYS, ALWAYS,
+        pair("target.scale_x", "target.scale_y"), ALWAYS, ALWAYS,
         "target", (5e-5, 1e-2), "aspect of the camera", "turn the target by 90 degrees",
         "The printer's feed stretched the pattern in one direction. The plate's marks are "
         "compressed along one of its axes.",
