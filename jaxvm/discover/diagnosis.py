@@ -38,7 +38,8 @@ class Finding:
             the order of the recording's observations; NaN where not fitted.
         gain: on held-out epochs.
         ranking: leading hypotheses at the time, as (words, evidence).
-        doubles: hypotheses that fitted nearly as well then; they are tried again at the end.
+        doubles: hypotheses that fitted nearly as well then.
+        alternatives: those that led then; they are tried again at the end.
         chosen: place of this one among them.
         sharing: how the bodies of its kind share it; None where there is only one.
         advice: further recordings that would tell it from its rivals, best first.
@@ -62,6 +63,7 @@ class Finding:
     gain: Gain
     ranking: tuple[tuple[str, float], ...]
     doubles: tuple[Hypothesis, ...]
+    alternatives: tuple[Hypothesis, ...]
     chosen: int
     sharing: Sharing | None = None
     advice: tuple[Advice, ...] = ()

@@ -10,7 +10,8 @@ from dataclasses import replace
 import numpy as np
 
 from jaxvm.discover.diagnosis import Finding
-from jaxvm.discover.select import evidence, identity, price_of_columns
+from jaxvm.discover.hypotheses import Hypothesis
+from jaxvm.discover.select import evidence, price_of_columns
 from jaxvm.network.scene import Scene
 from jaxvm.physics.forms import FORMS
 from jaxvm.solve.adjust import Adjustment
@@ -24,46 +25,88 @@ def prune(
 ) -> tuple[Adjustment, list[Finding]]:
     """Drop an earlier finding that the later ones made superfluous (Wald test against BIC)."""
     given = len(current.scene.effects) - len(findings)
-    groups = [np.arange(columns.start, columns.stop) for columns, _ in current.scene.places()]
-    drops = wald_drops(current, groups[given:])
-    for k, (finding, drop) in enumerate(zip(findings[:-1], drops, strict=False)):
-        drop = drop / current.variance_factor
-        price = price_of_columns(finding.hypothesis, len(finding.effect.amplitudes), drop, n)
-        if drop < price + len(finding.effect.constants) * np.log(n):
-            effects = current.scene.fitted_effects()
-            kept = (*effects[: given + k], *effects[given + k + 1 :])
-            return fit(current.scene.with_effects(kept, current.scene.room)), findings[
-                :k
-            ] + findings[k + 1 :]
+    earlier = [k for k in _superfluous(current, findings, n) if k < len(findings) - 1]
+    if earlier:
+        k = earlier[0]
+        effects = current.scene.fitted_effects()
+        kept = (*effects[: given + k], *effects[given + k + 1 :])
+        findings = findings[:k] + findings[k + 1 :]
+        return fit(current.scene.with_effects(kept, current.scene.room)), findings
     return current, findings
 
 
 def rename(
     current: Adjustment, findings: list[Finding], n: int, fit: Fit
 ) -> tuple[Adjustment, list[Finding]]:
-    """Give each finding the name among its near doubles that fits best beside all the others."""
-    given = len(current.scene.effects) - len(findings)
-    findings = list(findings)
-    for k, finding in enumerate(findings if len(findings) > 1 else []):
-        for other in finding.doubles:
-            if identity(other) == identity(findings[k].hypothesis):
-                continue
-            effects = list(current.scene.fitted_effects())
-            own = effects[given + k]
-            columns = len(other.group.terms) * len(FORMS[other.course.form].bases)
-            effects[given + k] = other.effect(np.zeros(columns))
-            tried = fit(current.scene.with_effects(tuple(effects), current.scene.room))
-            if not tried.converged:
-                continue
-            variance = min(current.variance_factor, tried.variance_factor)
-            drop = 2.0 * (current.cost - tried.cost)
-            effect = tried.scene.fitted_effects()[given + k]
-            new = evidence(other, drop, np.asarray(effect.amplitudes), variance, n)
-            old = evidence(findings[k].hypothesis, 0.0, np.asarray(own.amplitudes), variance, n)
-            if new > old:
-                current = tried
-                findings[k] = replace(
-                    findings[k], hypothesis=other, effect=effect, final_effect=effect,
-                    stds=(), rivals=(), weight=1.0,
-                )  # fmt: skip
+    """Give each finding the name that fits best beside all the others.
+
+    What led when it was found is tried again in its place, and so is what outweighs it now. A name
+    that makes another finding superfluous wins by what that one cost.
+    """
+    k = 0
+    while len(findings) > 1 and k < len(findings):
+        finding = findings[k]
+        heavier = [r.hypothesis for r in finding.rivals if r.weight > finding.weight]
+        for other in (*finding.alternatives, *heavier):
+            if not other.same(findings[k].hypothesis) and k < len(findings):
+                current, findings = _better(current, findings, k, other, n, fit)
+        k += 1
     return current, findings
+
+
+def _better(
+    current: Adjustment, findings: list[Finding], k: int, other: Hypothesis, n: int, fit: Fit
+) -> tuple[Adjustment, list[Finding]]:
+    """Findings with another hypothesis in place of the k-th, where that has more evidence."""
+    scene, given = current.scene, len(current.scene.effects) - len(findings)
+    effects = list(scene.fitted_effects())
+    columns = len(other.group.terms) * len(FORMS[other.course.form].bases)
+    effects[given + k] = other.effect(np.zeros(columns))
+    tried = fit(scene.with_effects(tuple(effects), scene.room))
+    if not tried.converged:
+        return current, findings
+    renamed = replace(findings[k], hypothesis=other, stds=(), rivals=(), weight=1.0)
+    new = [*findings[:k], renamed, *findings[k + 1 :]]
+    needless = [j for j in _superfluous(tried, new, n) if j != k]
+    if needless:
+        effects = tried.scene.fitted_effects()
+        kept = tuple(e for j, e in enumerate(effects) if j - given not in needless)
+        tried = fit(scene.with_effects(kept, scene.room))
+        new = [finding for j, finding in enumerate(new) if j not in needless]
+    new = _with_effects(new, tried)
+    variance = min(current.variance_factor, tried.variance_factor)
+    gained = 2.0 * (current.cost - tried.cost) / variance
+    cost = _complexity(new, variance, n) - _complexity(findings, variance, n)
+    return (tried, new) if tried.converged and gained > cost else (current, findings)
+
+
+def _with_effects(findings: list[Finding], fitted: Adjustment) -> list[Finding]:
+    effects = fitted.scene.fitted_effects()[-len(findings) :]
+    return [
+        replace(finding, effect=effect, final_effect=effect)
+        for finding, effect in zip(findings, effects, strict=True)
+    ]
+
+
+def _complexity(findings: list[Finding], variance: float, n: int) -> float:
+    """What the findings cost: columns, constants, implausibility (on the scale of chi-square)."""
+    return sum(
+        f.drop / variance
+        - evidence(f.hypothesis, f.drop, np.asarray(f.effect.amplitudes), variance, n)
+        for f in findings
+    )
+
+
+def _superfluous(current: Adjustment, findings: list[Finding], n: int) -> list[int]:
+    """Findings that the others make superfluous (Wald test against BIC)."""
+    given = len(current.scene.effects) - len(findings)
+    groups = [np.arange(columns.start, columns.stop) for columns, _ in current.scene.places()]
+    found = []
+    for k, (finding, drop) in enumerate(
+        zip(findings, wald_drops(current, groups[given:]), strict=True)
+    ):
+        drop = drop / current.variance_factor
+        price = price_of_columns(finding.hypothesis, len(finding.effect.amplitudes), drop, n)
+        if drop < price + len(finding.effect.constants) * np.log(n):
+            found.append(k)
+    return found

@@ -9,7 +9,7 @@ from jaxvm.discover.accept import Accepted, accept, short
 from jaxvm.discover.detail import with_detail
 from jaxvm.discover.diagnosis import Finding
 from jaxvm.discover.heldout import HeldOut, Split
-from jaxvm.discover.hypotheses import enumerate_hypotheses
+from jaxvm.discover.hypotheses import FREE, Hypothesis, enumerate_hypotheses
 from jaxvm.discover.noise import LONGEST, memory, multipliers
 from jaxvm.discover.ranking import Ranking, noise_of, spread_of_constant, surprise
 from jaxvm.discover.revise import prune, rename
@@ -27,13 +27,19 @@ ALPHA = 0.01
 """Family-wise probability to claim something where nothing is hidden."""
 
 DOUBT = 0.1
-"""Weight taken from a name where something is left that it should explain: a cautious choice.
+"""Weight taken from a name where something speaks against it (`_doubted`): a cautious choice.
 
 It keeps every such name below the 95 % from which a reader may call it sure.
 """
 
 DOUBTFUL = 0.05
 """Probability of what is left at a finding's own ports from which its course is doubted."""
+
+_TRIED_AGAIN = 8
+"""Leading hypotheses that are tried again in place of a finding beside all the others."""
+
+_WORSE = 1.01
+"""Rise of the held-out RMS that other names may bring: what differs less is noise."""
 
 FLIPS = 199
 """Repetitions of the null distribution."""
@@ -217,6 +223,7 @@ class Search:
             gain=accepted.gain,
             ranking=tuple((short(h), e) for h, e, _ in leading),
             doubles=tuple(candidate.hypothesis for candidate in accepted.near),
+            alternatives=_alternatives(accepted, leading),
             chosen=next(k for k, (h, *_) in enumerate(leading) if h.same(chosen.hypothesis)),
         )
 
@@ -281,11 +288,16 @@ class Search:
             self._drop_unconfirmed()
             self.current, self.heldout = parts.proven(self.current)
         names = [finding.hypothesis for finding in self.findings]
-        if self.p_value > self.alpha:
-            # While something is left, names can't be decided better than when they were found.
-            self.current, self.findings = rename(self.current, self.findings, parts.n, parts.fit)
-        if len(self.findings) > 1:
+        if len(names) > 1:
+            self._rename()
             self.findings = [self._weighed_again(k) for k in range(len(self.findings))]
+            if any(r.weight > f.weight for f in self.findings for r in f.rivals):
+                self._rename()
+                again = [not f.rivals and not f.stds for f in self.findings]
+                self.findings = [
+                    self._weighed_again(k) if own else self.findings[k]
+                    for k, own in enumerate(again)
+                ]
         if [finding.hypothesis for finding in self.findings] != names:
             self.current, self.heldout = parts.proven(self.current)
             deviations = effect_deviations(self.current)[self.given :]
@@ -300,18 +312,26 @@ class Search:
             self.unproven = self.unproven if self.p_value <= self.alpha else ""
         self.findings = [self._doubted(finding) for finding in self.findings]
 
+    def _rename(self) -> None:
+        """Better names beside all the others, where held-out epochs don't speak against them."""
+        current, findings = rename(self.current, self.findings, self.parts.n, self.parts.fit)
+        shown = self.parts.evaluate(current.scene)
+        if shown.rms_px <= _WORSE * self.heldout.rms_px:
+            self.current, self.findings = current, findings
+
     def _doubted(self, finding: Finding) -> Finding:
         """A finding's weights where something is left: it may be that of which this is a part.
 
         What is left need not be significant among all hypotheses; at the finding's own ports, or in
         its harmonics, it speaks against the course that was named. So does the same name for the
-        same body twice.
+        same body twice. And a free form fits what has another name, or none, as well as its own.
         """
         effect = finding.effect
         left = self.ranking.left_at({term.port for term in effect.terms}, effect.scope)
         left = min(left, self.ranking.left_in_harmonics(effect))
         alike = [f for f in self.findings if identity(f.hypothesis) == identity(finding.hypothesis)]
-        if self.p_value > self.alpha and left > DOUBTFUL and len(alike) == 1:
+        free = len(effect.amplitudes) > FREE
+        if self.p_value > self.alpha and left > DOUBTFUL and len(alike) == 1 and not free:
             return finding
         sure = 1.0 - DOUBT
         others = tuple(replace(r, weight=sure * r.weight) for r in finding.rivals)
@@ -345,6 +365,14 @@ class Search:
         scene = self.current.scene
         self.current = self.parts.fit(scene.with_effects(effects, scene.room))
         self.findings = [self.findings[k] for k in kept]
+
+
+def _alternatives(accepted: Accepted, leading) -> tuple[Hypothesis, ...]:
+    """What was refitted, and what else led with few columns."""
+    tried = [candidate.hypothesis for candidate in accepted.tried]
+    others = [h for h, _, amplitudes in leading if len(amplitudes) <= FREE]
+    others = [h for h in others if not any(h.same(own) for own in tried)]
+    return tuple((tried + others)[:_TRIED_AGAIN])
 
 
 def _as_good(accepted: Accepted, leading):
