@@ -16,7 +16,7 @@ from tally import FLOOR_RATIO, wilson
 
 HERE = Path(__file__).parent
 GOOD, BAD, INK = "#0f766e", "#c2410c", "#334155"
-MOST_NAMES = 40
+MOST_NAMES = 80
 
 
 def inside_effects(rows: list[dict]) -> list[tuple[dict, dict]]:
