@@ -17,6 +17,8 @@ largest statistic over all hypotheses in each repetition gives a family-wise p-v
 independence inside an epoch (wild bootstrap of the scores).
 """
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -55,6 +57,7 @@ class ScoreTests:
     arrangement: Arrangement
     battery: Battery
     _known: dict[tuple[int, int, int], "_Information"] = field(default_factory=dict)
+    _patterns: dict[tuple, np.ndarray] = field(default_factory=dict)
 
     @classmethod
     def of(cls, fit: Adjustment, families: tuple[Family, ...]) -> "ScoreTests":
@@ -93,7 +96,10 @@ class ScoreTests:
         cells = self.arrangement.cells
         e = cells.residual if residual is None else self.arrangement.in_cells(residual)
         tested = _Tested.of(cells, e, variance, signs, studentised)
-        scores = tuple(self._of_family(f, tested) for f in range(len(self.battery.families)))
+        # NumPy lets other threads run while it multiplies; families share nothing that they write.
+        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+            each = pool.map(lambda f: self._of_family(f, tested), range(len(self.battery.families)))
+            scores = tuple(each)
         return Ranking(scores, np.max([s.null.max(axis=0) for s in scores], axis=0))
 
     def _of_family(self, number: int, tested: "_Tested") -> Scores:
@@ -130,8 +136,7 @@ class ScoreTests:
 
     def _ports_and_patterns(self, family: Family):
         """Port numbers [terms] and patterns [terms, cells, observations] of each group."""
-        arrangement = self.arrangement
-        known: dict[tuple, np.ndarray] = {}
+        arrangement, known = self.arrangement, self._patterns
         for group in family.groups:
             patterns = []
             for term in group.terms:

@@ -1,0 +1,71 @@
+"""How long does the diagnosis of a recording of about 40,000 residuals take, warm?
+
+Large station recordings of the sealed benchmark's independent world (two cameras, hours, reference
+and moving targets), each with one hidden effect or none. Each is diagnosed in one process that has
+diagnosed it once before; the second time counts.
+"""
+
+import json
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parent / "sealed"))
+
+from world import record  # noqa: E402
+
+from jaxvm.discover import diagnose  # noqa: E402
+from jaxvm.recording import read_recording  # noqa: E402
+from jaxvm.solve.compiling import keep_compiled  # noqa: E402
+
+HIDDEN = (
+    (),
+    ("focal-grows-with-heat",),
+    ("mount-slips",),
+    ("principal-point-walks-with-lag",),
+    ("target-bow",),
+    ("range-index-wrong",),
+    ("mount-creeps",),
+)
+"""One recording each; none is drawn by what it takes."""
+
+
+def main() -> None:
+    keep_compiled()
+    rows = []
+    with tempfile.TemporaryDirectory() as work:
+        for number, hidden in enumerate(HIDDEN):
+            folder = Path(work, str(number))
+            record("station", 1000 + number, hidden, size="large").write(folder)
+            recording = read_recording(folder)
+            seconds = []
+            for _ in range(2):
+                began = time.perf_counter()
+                found = diagnose(recording)
+                seconds.append(time.perf_counter() - began)
+            ranges = recording.ranges
+            rows.append(
+                {
+                    "hidden": hidden,
+                    "residuals": 2 * len(recording.observations.epoch)
+                    + (0 if ranges is None else len(ranges.epoch)),
+                    "first_s": seconds[0],
+                    "warm_s": seconds[1],
+                    "hypotheses": found.n_hypotheses,
+                    "findings": [finding.effect.name for finding in found.findings],
+                }
+            )
+            print(json.dumps(rows[-1]), flush=True)
+    warm = [row["warm_s"] for row in rows]
+    results = {"runs": rows, "median_s": float(np.median(warm)), "processors": os.cpu_count()}
+    (HERE / "results.json").write_text(json.dumps(results, indent=1) + "\n")
+    print(f"median {results['median_s']:.1f} s, largest {max(warm):.1f} s")
+
+
+if __name__ == "__main__":
+    main()
