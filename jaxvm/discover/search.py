@@ -35,8 +35,8 @@ It keeps every such name below the 95 % from which a reader may call it sure.
 DOUBTFUL = 0.05
 """Probability of what is left at a finding's own ports from which its course is doubted."""
 
-_TRIED_AGAIN = 8
-"""Leading hypotheses that are tried again in place of a finding beside all the others."""
+_TRIED_AGAIN, _HOPEFUL = 6, 0.75
+"""Leading hypotheses that are tried again in place of a finding; their share of its evidence."""
 
 _WORSE = 1.01
 """Rise of the held-out RMS that other names may bring: what differs less is noise."""
@@ -368,10 +368,12 @@ class Search:
 
 
 def _alternatives(accepted: Accepted, leading) -> tuple[Hypothesis, ...]:
-    """What was refitted, and what else led with few columns."""
-    tried = [candidate.hypothesis for candidate in accepted.tried]
-    others = [h for h, _, amplitudes in leading if len(amplitudes) <= FREE]
-    others = [h for h in others if not any(h.same(own) for own in tried)]
+    """What was refitted, and what else led with few columns, if it was not far behind."""
+    best = accepted.chosen.evidence
+    tried = [c.hypothesis for c in accepted.tried if c.evidence > _HOPEFUL * best]
+    least = _HOPEFUL * leading[0][1]
+    others = [h for h, own, amplitudes in leading if len(amplitudes) <= FREE and own > least]
+    others = [h for h in others if not any(h.same(one) for one in tried)]
     return tuple((tried + others)[:_TRIED_AGAIN])
 
 
