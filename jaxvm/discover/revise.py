@@ -19,6 +19,10 @@ from jaxvm.solve.covariance import wald_drops
 
 Fit = Callable[[Scene], Adjustment]
 
+_MOST_TRIED = 12
+"""Alternatives that are fitted at most, those of the first findings first: what was named while
+most was missing is the likeliest to be wrong."""
+
 
 def prune(
     current: Adjustment, findings: list[Finding], n: int, fit: Fit
@@ -43,11 +47,13 @@ def rename(
     What led when it was found is tried again in its place, and so is what outweighs it now. A name
     that makes another finding superfluous wins by what that one cost.
     """
-    k = 0
+    k, left = 0, _MOST_TRIED
     while len(findings) > 1 and k < len(findings):
         finding = findings[k]
         heavier = [r.hypothesis for r in finding.rivals if r.weight > finding.weight]
-        for other in (*finding.alternatives, *heavier):
+        others = [h for h in finding.alternatives if not h.same(finding.hypothesis)][:left]
+        left -= len(others)
+        for other in (*others, *heavier):
             if not other.same(findings[k].hypothesis) and k < len(findings):
                 current, findings = _better(current, findings, k, other, n, fit)
         k += 1
