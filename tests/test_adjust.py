@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxvm.network.residual import residual
 from jaxvm.network.scene import build
+from jaxvm.physics.effects import Effect, Term
 from jaxvm.recording.model import Closure, Prior
 from jaxvm.solve.adjust import adjust
 from jaxvm.solve.arrow import factorise
@@ -113,6 +114,21 @@ def test_aspect_locked_focal_keeps_its_ratio():
     assert sd[1] / sd[0] == pytest.approx(true[1] / true[0], rel=1e-10)
     assert np.abs(focal - true).max() < 4 * sd.max()
     assert "camera cam3: focal" in result.scene.unknowns.names()
+
+
+def test_a_pattern_follows_the_principal_point_that_the_fit_moves():
+    """Radial distortion as an effect is about the fitted centre, wherever the fit began."""
+    known = board_recording(free=frozenset({"focal", "centre"}))
+    radial = Effect("radial", (Term("sensor.focal", driver="radius", basis="square"),))
+    scene = at_values(build(known.recording, (radial,)), known.truth)
+    state = eqx.tree_at(lambda s: s.distortion, scene.state, replace_fn=jnp.zeros_like)
+    far = eqx.tree_at(lambda s: s.centre, state, state.centre + jnp.array([[80.0, -60.0]]))
+    held = np.array(["centre" not in name for name in scene.unknowns.names()])
+    far = adjust(scene.with_state(far), active=held).scene.state  # the poses lean with it
+    near, moved = (adjust(scene.with_state(own)) for own in (state, far))
+    sd = np.asarray(standard_deviations(near).centre)
+    assert (np.abs(near.scene.state.centre - moved.scene.state.centre) < 0.5 * sd).all()
+    assert moved.cost == pytest.approx(near.cost, rel=1e-2)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])

@@ -54,23 +54,26 @@ def rename(
         others = [h for h in finding.alternatives if not h.same(finding.hypothesis)][:left]
         left -= len(others)
         for other in (*others, *heavier):
-            if not other.same(findings[k].hypothesis) and k < len(findings):
-                current, findings = _better(current, findings, k, other, n, fit)
+            if not other.same(findings[k].hypothesis):
+                current, findings, k = _better(current, findings, k, other, n, fit)
         k += 1
     return current, findings
 
 
 def _better(
     current: Adjustment, findings: list[Finding], k: int, other: Hypothesis, n: int, fit: Fit
-) -> tuple[Adjustment, list[Finding]]:
-    """Findings with another hypothesis in place of the k-th, where that has more evidence."""
+) -> tuple[Adjustment, list[Finding], int]:
+    """Findings with another hypothesis in place of the k-th, where that has more evidence.
+
+    And the place of that one: others may be superfluous then.
+    """
     scene, given = current.scene, len(current.scene.effects) - len(findings)
     effects = list(scene.fitted_effects())
     columns = len(other.group.terms) * len(FORMS[other.course.form].bases)
     effects[given + k] = other.effect(np.zeros(columns))
     tried = fit(scene.with_effects(tuple(effects), scene.room))
     if not tried.converged:
-        return current, findings
+        return current, findings, k
     renamed = replace(findings[k], hypothesis=other, stds=(), rivals=(), weight=1.0)
     new = [*findings[:k], renamed, *findings[k + 1 :]]
     needless = [j for j in _superfluous(tried, new, n) if j != k]
@@ -83,7 +86,9 @@ def _better(
     variance = min(current.variance_factor, tried.variance_factor)
     gained = 2.0 * (current.cost - tried.cost) / variance
     cost = _complexity(new, variance, n) - _complexity(findings, variance, n)
-    return (tried, new) if tried.converged and gained > cost else (current, findings)
+    if not tried.converged or gained <= cost:
+        return current, findings, k
+    return tried, new, k - sum(j < k for j in needless)
 
 
 def _with_effects(findings: list[Finding], fitted: Adjustment) -> list[Finding]:
@@ -105,14 +110,17 @@ def _complexity(findings: list[Finding], variance: float, n: int) -> float:
 
 def _superfluous(current: Adjustment, findings: list[Finding], n: int) -> list[int]:
     """Findings that the others make superfluous (Wald test against BIC)."""
-    given = len(current.scene.effects) - len(findings)
-    groups = [np.arange(columns.start, columns.stop) for columns, _ in current.scene.places()]
     found = []
-    for k, (finding, drop) in enumerate(
-        zip(findings, wald_drops(current, groups[given:]), strict=True)
-    ):
-        drop = drop / current.variance_factor
+    lost = lost_without(current, findings)
+    for k, (finding, rise) in enumerate(zip(findings, lost, strict=True)):
+        drop = rise / current.variance_factor
         price = price_of_columns(finding.hypothesis, len(finding.effect.amplitudes), drop, n)
         if drop < price + len(finding.effect.constants) * np.log(n):
             found.append(k)
     return found
+
+
+def lost_without(current: Adjustment, findings: list[Finding]) -> list[float]:
+    """Rise of twice the cost without each finding, all others refitted (Wald)."""
+    places = current.scene.places()[len(current.scene.effects) - len(findings) :]
+    return wald_drops(current, [np.arange(own.start, own.stop) for own, _ in places])

@@ -97,7 +97,7 @@ class ScoreTests:
         e = cells.residual if residual is None else self.arrangement.in_cells(residual)
         tested = _Tested.of(cells, e, variance, signs, studentised)
         # NumPy lets other threads run while it multiplies; families share nothing that they write.
-        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
             each = pool.map(lambda f: self._of_family(f, tested), range(len(self.battery.families)))
             scores = tuple(each)
         return Ranking(scores, np.max([s.null.max(axis=0) for s in scores], axis=0))

@@ -12,7 +12,7 @@ from jaxvm.discover.heldout import HeldOut, Split
 from jaxvm.discover.hypotheses import FREE, Hypothesis, enumerate_hypotheses
 from jaxvm.discover.noise import LONGEST, memory, multipliers
 from jaxvm.discover.ranking import Ranking, noise_of, spread_of_constant, surprise
-from jaxvm.discover.revise import prune, rename
+from jaxvm.discover.revise import lost_without, prune, rename
 from jaxvm.discover.rivals import rivals
 from jaxvm.discover.scatter import ALIKE, likeness, of_each_image
 from jaxvm.discover.score import ScoreTests
@@ -75,6 +75,7 @@ class Search:
     _tests: ScoreTests = field(init=False)
     _signs: np.ndarray = field(init=False)
     _hopeless: set = field(default_factory=set)
+    _superfluous: set = field(default_factory=set)
 
     def __post_init__(self) -> None:
         self._signs = multipliers(len(self.parts.held), 1, FLIPS, self.seed)
@@ -188,9 +189,11 @@ class Search:
             # What later findings made superfluous does not come back.
             kept = [finding.hypothesis for finding in self.findings]
             gone = [f.hypothesis for f in former if f.hypothesis not in kept]
-            self._hopeless |= {(identity(h), h.course) for h in gone}
+            self._superfluous |= {(identity(h), h.course) for h in gone}
             self.current, self.heldout = parts.proven(self.current)
             self.findings = self._with_heir(former)
+        # What did not help before may help beside the new one.
+        self._hopeless = set(self._superfluous)
         self.findings = self._confirmed()
 
     def _finding(self, accepted: Accepted, leading) -> Finding:
@@ -241,15 +244,9 @@ class Search:
         findings = list(self.findings)
         if not findings:
             return findings
-        effects, scene = self.current.scene.fitted_effects(), self.current.scene
-        without = (
-            scene.with_effects((*effects[:k], *effects[k + 1 :]), scene.room)
-            for k in range(len(effects) - len(findings), len(effects))
-        )
-        costs = [self.parts.fit(scene).cost for scene in without]
-        heir = int(np.argmax(costs))
-        drop = 2.0 * (costs[heir] - self.current.cost)
-        findings[heir] = replace(findings[heir], drop=max(findings[heir].drop, drop))
+        lost = lost_without(self.current, findings)
+        heir = int(np.argmax(lost))
+        findings[heir] = replace(findings[heir], drop=max(findings[heir].drop, lost[heir]))
         return findings
 
     def _confirmed(self) -> list[Finding]:

@@ -1,7 +1,7 @@
 """Adjustment of a scene, and the summary that a surveyor reads."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax
@@ -16,6 +16,12 @@ from jaxvm.solve.gauge import check_gauge
 from jaxvm.solve.optimise import METHODS, minimise
 from jaxvm.solve.problem import Normal, Problem, normal_at, scaled, scene_problem
 from jaxvm.solve.robust import Loss
+
+_SAME = 1.0
+"""Sum of squared changes of whitened residuals up to which the patterns of effects are the same."""
+
+_REBOUND = 8
+"""Most adjustments about new patterns."""
 
 
 @dataclass(frozen=True)
@@ -101,6 +107,9 @@ def adjust(
 ) -> Adjustment:
     """Adjust a scene: find the free parameters that minimise the whitened residuals.
 
+    The patterns of effects over observations (their radius, incidence, range...) are those of the
+    start values. Where the solution moves them, it is adjusted again from there.
+
     Args:
         scene: scene at its start values.
         method: "levenberg-marquardt" or "gauss-newton".
@@ -110,7 +119,7 @@ def adjust(
         active: unknowns that may move; all by default.
         rtol: relative change of the cost at which it stops.
         damping: first damping of Levenberg-Marquardt, relative to a unit diagonal.
-        max_steps: bound on evaluations.
+        max_steps: bound on evaluations, each time.
         check: look for rank deficiency first.
 
     Raises:
@@ -120,6 +129,44 @@ def adjust(
     if method not in METHODS:
         raise ValueError(f'there is no method "{method}" (there are: {", ".join(METHODS)})')
     began, compiling = time.perf_counter(), compile_seconds()
+    options = dict(weights=weights, range_weights=range_weights, active=active, loss=loss)
+    options |= dict(rtol=rtol, damping=damping, max_steps=max_steps)
+    found = _adjusted(scene, method, check=check, **options)
+    for _ in range(_REBOUND):
+        if not found.converged or not _moved(found):
+            break
+        scene, first = found.scene, found
+        found = _adjusted(scene, method, check=False, **options)
+        found = replace(
+            found,
+            cost_before=first.cost_before,
+            evaluations=first.evaluations + found.evaluations,
+            accepted=first.accepted + found.accepted,
+            history=np.concatenate([first.history, found.history]),
+        )
+    return replace(
+        found,
+        seconds=time.perf_counter() - began,
+        seconds_compiling=compile_seconds() - compiling,
+    )
+
+
+def _moved(found: Adjustment) -> bool:
+    """Whether the patterns at the solution, instead of those at the start, change what it says."""
+    if not found.scene.effects:
+        return False
+    network, state = found.problem.network, _state(found.problem, found.x)
+    patterns = [factor.pattern for factor in found.scene.network.pixels]
+    anew = eqx.tree_at(lambda n: [factor.pattern for factor in n.pixels], network, patterns)
+    before, after = residual(state, network).pixels, residual(state, anew).pixels
+    change = sum(float(jnp.sum((b - a) ** 2)) for a, b in zip(before, after, strict=True))
+    return change > _SAME
+
+
+def _adjusted(
+    scene: Scene, method, loss, weights, range_weights, active, rtol, damping, max_steps, check
+) -> Adjustment:
+    """The adjustment with the patterns of the start values."""
     problem = scene_problem(scene, loss)
     if weights is not None:
         problem = with_weights(problem, weights)
@@ -151,8 +198,8 @@ def adjust(
         accepted=int(last.accepted),
         history=history,
         why=why,
-        seconds=time.perf_counter() - began,
-        seconds_compiling=compile_seconds() - compiling,
+        seconds=0.0,
+        seconds_compiling=0.0,
     )
 
 
