@@ -1,0 +1,1 @@
+"""Cameras and temperature: drift models, couplings, identification, compensation."""
