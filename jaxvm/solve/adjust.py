@@ -132,17 +132,21 @@ def adjust(
     options = dict(weights=weights, range_weights=range_weights, active=active, loss=loss)
     options |= dict(rtol=rtol, damping=damping, max_steps=max_steps)
     found = _adjusted(scene, method, check=check, **options)
+    before = np.inf
     for _ in range(_REBOUND):
-        if not found.converged or not _moved(found):
+        # A fit that creeps moves the patterns on for ever: it ends where they no longer settle.
+        change = _moved(found) if found.converged else 0.0
+        if not _SAME < change < 0.5 * before:
             break
-        scene, first = found.scene, found
-        found = _adjusted(scene, method, check=False, **options)
+        again, before = _adjusted(found.scene, method, check=False, **options), change
+        if again.failed:
+            break
         found = replace(
-            found,
-            cost_before=first.cost_before,
-            evaluations=first.evaluations + found.evaluations,
-            accepted=first.accepted + found.accepted,
-            history=np.concatenate([first.history, found.history]),
+            again,
+            cost_before=found.cost_before,
+            evaluations=found.evaluations + again.evaluations,
+            accepted=found.accepted + again.accepted,
+            history=np.concatenate([found.history, again.history]),
         )
     return replace(
         found,
@@ -151,16 +155,15 @@ def adjust(
     )
 
 
-def _moved(found: Adjustment) -> bool:
-    """Whether the patterns at the solution, instead of those at the start, change what it says."""
+def _moved(found: Adjustment) -> float:
+    """Sum of squared changes of whitened residuals by the patterns at the solution."""
     if not found.scene.effects:
-        return False
+        return 0.0
     network, state = found.problem.network, _state(found.problem, found.x)
     patterns = [factor.pattern for factor in found.scene.network.pixels]
     anew = eqx.tree_at(lambda n: [factor.pattern for factor in n.pixels], network, patterns)
-    before, after = residual(state, network).pixels, residual(state, anew).pixels
-    change = sum(float(jnp.sum((b - a) ** 2)) for a, b in zip(before, after, strict=True))
-    return change > _SAME
+    old, new = residual(state, network).pixels, residual(state, anew).pixels
+    return sum(float(jnp.sum((b - a) ** 2)) for a, b in zip(old, new, strict=True))
 
 
 def _adjusted(
