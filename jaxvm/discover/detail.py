@@ -93,6 +93,7 @@ def _mapped(
             rtol=_RTOL,
             damping=1e-6,
             max_steps=_MAX_STEPS,
+            repeats=0,
             check=False,
         )
 

@@ -20,9 +20,6 @@ from jaxvm.solve.robust import Loss
 _SAME = 1.0
 """Sum of squared changes of whitened residuals up to which the patterns of effects are the same."""
 
-_REBOUND = 8
-"""Most adjustments about new patterns."""
-
 
 @dataclass(frozen=True)
 class Adjustment:
@@ -103,6 +100,7 @@ def adjust(
     rtol: float = 1e-12,
     damping: float = 1e-3,
     max_steps: int = 100,
+    repeats: int = 8,
     check: bool = True,
 ) -> Adjustment:
     """Adjust a scene: find the free parameters that minimise the whitened residuals.
@@ -120,6 +118,7 @@ def adjust(
         rtol: relative change of the cost at which it stops.
         damping: first damping of Levenberg-Marquardt, relative to a unit diagonal.
         max_steps: bound on evaluations, each time.
+        repeats: how often it may be repeated about the patterns of effects at the solution.
         check: look for rank deficiency first.
 
     Raises:
@@ -133,7 +132,7 @@ def adjust(
     options |= dict(rtol=rtol, damping=damping, max_steps=max_steps)
     found = _adjusted(scene, method, check=check, **options)
     before = np.inf
-    for _ in range(_REBOUND):
+    for _ in range(repeats):
         # A fit that creeps moves the patterns on for ever: it ends where they no longer settle.
         change = _moved(found) if found.converged else 0.0
         if not _SAME < change < 0.5 * before:
