@@ -1,6 +1,7 @@
 """Pure functions of geometry: rotations, poses, lenses, targets, absolute orientation."""
 
 from jaxvm.geometry.alignment import align as align
+from jaxvm.geometry.alignment import nearest_rotation as nearest_rotation
 from jaxvm.geometry.lenses import LENS_NAMES as LENS_NAMES
 from jaxvm.geometry.lenses import BrownConrady as BrownConrady
 from jaxvm.geometry.lenses import KannalaBrandt as KannalaBrandt

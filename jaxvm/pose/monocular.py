@@ -1,10 +1,12 @@
 """Pose of a target from one camera: orthogonal iteration with a global start, both minima.
 
 The object-space error of Lu, Hager and Mjolsness (2000) has one deep minimum, and for a plane seen
-from afar a second one, tilted to the other side (Schweighofer and Pinz 2006). Starts are rotations
-near the flat directions of the error's quadratic form (Terzakis and Lourakis 2020) and that of weak
-perspective; each is iterated, and of the best one the mirrored pose is tried, too. What comes out
-is refined to maximum likelihood (`jaxvm.pose.refine`).
+from afar a second one, tilted to the other side (Schweighofer and Pinz 2006). `locate` starts from
+the rotations near the flat directions of the error's quadratic form (Terzakis and Lourakis 2020),
+goes to the minimum of each by Newton steps, tries the mirrored pose of the best one, too, and
+refines both to maximum likelihood (`jaxvm.pose.refine`). `orthogonal_iteration` is that of Lu,
+Hager and Mjolsness: it gets to a minimum of the same error in many more steps, from weak
+perspective.
 """
 
 import equinox as eqx
@@ -12,7 +14,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxvm.geometry import Pose, pose_from_vector, so3_exp, so3_log, vector_from_pose
+from jaxvm.geometry import (
+    Pose,
+    nearest_rotation,
+    pose_from_vector,
+    so3_exp,
+    so3_log,
+    vector_from_pose,
+)
 from jaxvm.pose.object_space import ObjectSpace, object_space
 from jaxvm.pose.refine import Refined, refine
 from jaxvm.pose.sighting import Sighting
@@ -31,7 +40,7 @@ class Minimum(eqx.Module):
 
     Attributes:
         pose: camera_from_target.
-        error: E (m^2); infinite where there is no such minimum.
+        error: E (m^2).
         iterations: until it stood still.
     """
 
@@ -138,20 +147,13 @@ def _centred(sighting: Sighting, weight) -> tuple[Pose, ObjectSpace]:
     return frame, object_space((points - mean) @ axes, sighting.image, weight)
 
 
-def _nearest(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """Rotation nearest to a matrix (Arun 1987)."""
-    u, _, vt = jnp.linalg.svd(matrix)
-    flip = jnp.array([1.0, 1.0, 0.0]) + jnp.array([0.0, 0.0, 1.0]) * jnp.linalg.det(u @ vt)
-    return (u * flip) @ vt
-
-
 def _step(space: ObjectSpace, rotation: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     """One orthogonal iteration: the marks' nearest points on the rays, and the rotation to them.
 
     sum w V (R p + t) (p - mean)^T = R C - mat(Omega r), because F (R p + t) sums to zero.
     """
     pull = (space.omega @ rotation.reshape(9)).reshape(3, 3)
-    return _nearest(rotation @ space.spread - pull)
+    return nearest_rotation(rotation @ space.spread - pull)
 
 
 def _weak_perspective(sighting: Sighting, frame: Pose) -> Float[Array, "3 3"]:
@@ -159,14 +161,14 @@ def _weak_perspective(sighting: Sighting, frame: Pose) -> Float[Array, "3 3"]:
     weight = _weights(sighting)
     centred = jax.vmap(frame.apply)(sighting.points)
     rays = jnp.concatenate([sighting.image, jnp.ones((len(sighting.image), 1))], axis=1)
-    return _nearest(jnp.einsum("n,na,nc->ac", weight, rays, centred))
+    return nearest_rotation(jnp.einsum("n,na,nc->ac", weight, rays, centred))
 
 
 def _global_minimum(space: ObjectSpace) -> Float[Array, "3 3"]:
     """The best rotation of all starts that has the target before the camera."""
     _, vectors = jnp.linalg.eigh(space.omega)
     flat = vectors[:, :_EIGENVECTORS].T.reshape(-1, 3, 3)
-    starts = jax.vmap(_nearest)(jnp.concatenate([flat, -flat]))
+    starts = jax.vmap(nearest_rotation)(jnp.concatenate([flat, -flat]))
     found = jax.vmap(lambda start: _polished(space, start))(starts)
     error = jax.vmap(space.error)(found)
     error = jnp.where(jax.vmap(lambda r: _before(space, r))(found), error, jnp.inf)

@@ -9,16 +9,19 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import optimistix as optx
 from jaxtyping import Array, Float
 
 from jaxvm.geometry import Pose, pose_from_vector, so3_exp, vector_from_pose
+from jaxvm.physics.chain import Aim, Circumstances, predict_range
+from jaxvm.physics.ports import PortValues
 from jaxvm.pose.monocular import locate
 from jaxvm.pose.orientation import orient
 from jaxvm.pose.refine import Refined
 from jaxvm.pose.sighting import Sighting
 from jaxvm.pose.triangulate import optimal
 
-_STEPS = 30
+_STEPS, _RTOL = 100, 1e-10
 
 
 class Ranges(eqx.Module):
@@ -26,8 +29,8 @@ class Ranges(eqx.Module):
 
     Attributes:
         station_from_rangefinder: (turn, shift); the beam is the instrument's z axis.
-        point: the mark in target coordinates (m), or any point of the plane.
-        to_plane: 1 where the beam meets the target's plane z = const, 0 for the distance to a mark.
+        point: the mark in target coordinates (m); not read where the beam meets the plane.
+        to_plane: 1 where the beam meets the target's plane z = 0, 0 for the distance to a mark.
         distance: what was measured (m).
         sigma: its standard deviation (m).
     """
@@ -45,12 +48,12 @@ class Ranges(eqx.Module):
     def predicted(self, station_from_target: Pose) -> Float[Array, " m"]:
         """Distances (m): along the beam to the plane, n.(t - o) / (n.d), or to the mark."""
 
+        # The plain chain reads none of its circumstances.
+        none = Circumstances(*[jnp.zeros(())] * len(Circumstances._fields))
+
         def one(vector, point, to_plane):
-            seen = pose_from_vector(vector).inverse() @ station_from_target
-            mark, normal = seen.apply(point), seen.rotation[:, 2]
-            across = jnp.where(to_plane > 0.5, normal[2], 1.0)
-            distance = jnp.sqrt(jnp.where(to_plane > 0.5, 1.0, mark @ mark))
-            return jnp.where(to_plane > 0.5, normal @ mark / across, distance)
+            aim = Aim(vector, jnp.zeros(6), vector_from_pose(station_from_target), point)
+            return predict_range(aim, none, to_plane, PortValues())
 
         return jax.vmap(one)(self.station_from_rangefinder, self.point, self.to_plane)
 
@@ -64,12 +67,10 @@ def locate_from_station(
     """Maximum-likelihood pose station_from_target from the cameras and rangefinders of a station.
 
     Args:
-        sightings: of every camera, stacked: [c, n, ...]; with ranges alone missing cameras are no
-            help, at least one camera is needed.
+        sightings: of every camera, stacked: [c, n, ...].
         station_from_camera: (turn, shift) of every camera.
         ranges: of the station's rangefinders.
-        start: station_from_target; without it that of the camera that sees most, and with a range
-            moved along its axis.
+        start: station_from_target; without it that of the camera that knows it best.
     """
     cameras = jax.vmap(lambda v: pose_from_vector(v).inverse())(station_from_camera)
     if start is None:
@@ -111,33 +112,18 @@ def most_likely(
         turn = so3_exp(change[:3])
         return Pose(turn @ pose.rotation, turn @ pose.shift + change[3:])
 
-    def linearised(pose: Pose):
-        slope = jax.jacfwd(lambda change: residuals(moved(pose, change)))(jnp.zeros(6))
-        e = residuals(pose)
-        return e @ e, slope.T @ e, slope.T @ slope
-
-    def step(state):
-        pose, cost, pull, hessian, damping, count, _ = state
-        damped = hessian + damping * jnp.diag(jnp.diag(hessian))
-        change = -jnp.linalg.solve(damped, pull)
-        new = moved(pose, change)
-        new_cost, new_pull, new_hessian = linearised(new)
-        better = new_cost <= cost
-        still = -change @ pull <= 1e-14 * cost + 1e-20
-        kept = jax.tree.map(
-            lambda a, b: jnp.where(better, a, b),
-            (new, new_cost, new_pull, new_hessian),
-            (pose, cost, pull, hessian),
-        )
-        damping = jnp.where(better, 0.1 * damping, jnp.maximum(10.0 * damping, 1e-3))
-        return *kept, damping, count + 1, still
-
-    pose = pose_from_vector(start)
-    state = pose, *linearised(pose), jnp.asarray(1e-6), jnp.asarray(0), jnp.asarray(False)
-    pose, cost, _, hessian, _, count, _ = jax.lax.while_loop(
-        lambda s: ~s[-1] & (s[-2] < _STEPS), step, state
+    first = pose_from_vector(start)
+    found = optx.least_squares(
+        lambda change, _: residuals(moved(first, change)),
+        optx.LevenbergMarquardt(rtol=_RTOL, atol=_RTOL),
+        jnp.zeros(6),
+        max_steps=_STEPS,
+        throw=False,
     )
-    return Refined(vector_from_pose(pose), cost, jnp.linalg.inv(hessian), count)
+    pose = moved(first, found.value)
+    e, slope = residuals(pose), jax.jacfwd(lambda c: residuals(moved(pose, c)))(jnp.zeros(6))
+    covariance = jnp.linalg.inv(slope.T @ slope)
+    return Refined(vector_from_pose(pose), e @ e, covariance, found.stats["num_steps"])
 
 
 def _start(sightings: Sighting, station_from_camera) -> Float[Array, "6"]:
