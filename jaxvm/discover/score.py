@@ -96,7 +96,8 @@ class ScoreTests:
         cells = self.arrangement.cells
         e = cells.residual if residual is None else self.arrangement.in_cells(residual)
         tested = _Tested.of(cells, e, variance, signs, studentised)
-        # NumPy lets other threads run while it multiplies; families share nothing that they write.
+        # NumPy lets other threads run while it multiplies. All that families share is patterns,
+        # and those that two of them make at once are equal.
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             each = pool.map(lambda f: self._of_family(f, tested), range(len(self.battery.families)))
             scores = tuple(each)

@@ -158,10 +158,14 @@ def _moved(found: Adjustment) -> float:
     """Sum of squared changes of whitened residuals by the patterns at the solution."""
     if not found.scene.effects:
         return 0.0
+
+    def patterns(network):
+        ranges = () if network.ranges is None else (network.ranges.pattern,)
+        return [*(factor.pattern for factor in network.pixels), *ranges]
+
     network, state = found.problem.network, _state(found.problem, found.x)
-    patterns = [factor.pattern for factor in found.scene.network.pixels]
-    anew = eqx.tree_at(lambda n: [factor.pattern for factor in n.pixels], network, patterns)
-    old, new = residual(state, network).pixels, residual(state, anew).pixels
+    anew = eqx.tree_at(patterns, network, patterns(found.scene.network))
+    old, new = jax.tree.leaves(residual(state, network)), jax.tree.leaves(residual(state, anew))
     return sum(float(jnp.sum((b - a) ** 2)) for a, b in zip(old, new, strict=True))
 
 
