@@ -125,6 +125,20 @@ def _parser() -> argparse.ArgumentParser:
         "--loss", choices=("squared", "huber", "cauchy", "tukey"), default="squared"
     )
 
+    identify = command("identify", _identify, "identify how cameras drift with temperature")
+    _recording_argument(identify)
+    identify.add_argument("--out", type=Path, default=Path("drift.toml"), metavar="FILE")
+    identify.add_argument(
+        "--two-steps", action="store_true", help="do not refine through the residual of the network"
+    )
+
+    compensate = command("compensate", _compensate, "take drift off the pixels of a recording")
+    compensate.add_argument("recording", help="folder of a recording")
+    compensate.add_argument(
+        "--model", type=Path, required=True, metavar="FILE", help="what jaxvm identify wrote"
+    )
+    compensate.add_argument("--out", type=Path, required=True, metavar="RECORDING")
+
     simulate = command("simulate", _simulate, "write a simulated recording")
     simulate.add_argument("scene", choices=("deformation",), help="what to simulate")
     simulate.add_argument("--out", type=Path, required=True, metavar="RECORDING")
@@ -300,6 +314,41 @@ def _adjust(options):
         write_files(options.out, files)
         text += f"\nwritten            {options.out}: {', '.join(files)}"
     return answer, text
+
+
+def _identify(options):
+    from jaxvm.identify import identify
+    from jaxvm.recording.files import write_files
+    from jaxvm.solve.compiling import keep_compiled
+
+    keep_compiled()
+    recording = _open(options.recording, options.model)
+    found = identify(recording, one_step=not options.two_steps, progress=_progress(options))
+    write_files(options.out.absolute().parent, {options.out.name: found.model.text()})
+    answer = {"model": str(options.out), "cameras": [own.as_dict() for own in found.cameras]}
+    return answer, f"{found.summary()}\n\nwritten    {options.out}"
+
+
+def _compensate(options):
+    from jaxvm.identify import compensate, read_drift_model
+    from jaxvm.identify.poses import image_poses
+    from jaxvm.recording import write_recording
+    from jaxvm.recording.files import write_files
+    from jaxvm.solve.compiling import keep_compiled
+
+    keep_compiled()
+    progress = _progress(options)
+    recording, model = _open(options.recording), read_drift_model(options.model)
+    found = compensate(recording, model)
+    progress("poses before and after")
+    poses = {
+        "poses-before.csv": image_poses(recording).to_csv(index=False),
+        "poses.csv": image_poses(found.recording).to_csv(index=False),
+    }
+    write_recording(found.recording, options.out)
+    write_files(options.out, poses)
+    answer = found.as_dict() | {"recording": str(options.out)}
+    return answer, f"{found.summary()}\nwritten    {options.out}, with {', '.join(poses)}"
 
 
 def _simulate(options):

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxvm.network.scene import Scene
-from jaxvm.physics.drivers import OWN_BODY, channel_kind
+from jaxvm.physics.drivers import OWN_BODY, SESSION, channel_kind
 from jaxvm.physics.effects import Channels, Scope
 
 _FEWEST_EPOCHS = 6
@@ -18,6 +18,9 @@ _FEWEST_EPOCHS = 6
 
 _MOST_INSTANTS = 60
 """Instants at which a step is asked."""
+
+_RAMPS, _EVENTS = np.linspace(0.1, 0.8, 8), np.linspace(0.1, 0.7, 7)
+"""Shares of the epochs before a ramp, or an event after which something settles."""
 
 _MOST_OF_MARKS = 3000
 """Hypotheses about single marks; where marks and instants are many, fewer instants are asked."""
@@ -93,7 +96,7 @@ def _of_quantity(driver: str, channels: Channels, lags: list[float]) -> list[Cou
     width = float(np.ptp(values))
     if width == 0.0:
         return []
-    reference, span = channels.mean(driver), _span(channels)
+    reference, span = _reference(driver, channels), _span(channels)
     hours = np.asarray(channels.epoch_time) / 3600.0
     rate = float(np.median(np.abs(np.gradient(values, hours))))
     return [
@@ -128,7 +131,7 @@ def _of_quantity(driver: str, channels: Channels, lags: list[float]) -> list[Cou
 
 def _of_own(driver: str, channels: Channels, lags: list[float]) -> list[Course]:
     """A quantity that each camera has for itself: with a constant, too, as cameras differ."""
-    reference = channels.mean(driver)
+    reference = _reference(driver, channels)
     width = float(np.ptp(_recorded(driver, channels)))
     forms = ("linear", "affine", "quadratic", "parabola")
     return [
@@ -144,7 +147,7 @@ def _of_own(driver: str, channels: Channels, lags: list[float]) -> list[Course]:
 
 def _of_difference(driver: str, channels: Channels, lags: list[float]) -> list[Course]:
     """A difference of two temperatures: followed at once or late."""
-    reference = channels.mean(driver)
+    reference = _reference(driver, channels)
     return [
         *(Course(driver, form, (), reference) for form in ("linear", "affine")),
         *(Course(driver, "lag", (tau,), reference) for tau in lags[1::2]),
@@ -170,22 +173,21 @@ def _of_power_on(driver: str, channels: Channels, lags: list[float]) -> list[Cou
 def _of_time(driver: str, channels: Channels, lags: list[float]) -> list[Course]:
     """Time: trends, steps between epochs, ramps, a comb of periods, what settles after an event."""
     span = _span(channels)
-    time = np.asarray(channels.epoch_time)
-    since = time - time[0]
+    since = np.unique(np.interp(channels.epoch_time, channels.time, _recorded(driver, channels)))
     instants = (0.5 * (since[1:] + since[:-1]))[2:-2]
     if len(instants) > _MOST_INSTANTS:
         instants = instants[np.linspace(0, len(instants) - 1, _MOST_INSTANTS).astype(int)]
     periods = span / np.arange(1.0, min(span / (2.5 * _spacing(channels)), 34.0), 0.5)
     return [
         *_of_clock(driver, channels, lags),
-        Course(driver, "linear", (), channels.mean(driver)),
+        Course(driver, "linear", (), _reference(driver, channels)),
         Course(driver, "proportional"),
         *(Course(driver, "step", (t,)) for t in instants.tolist()),
-        *(Course(driver, "ramp", (t,)) for t in (np.linspace(0.1, 0.8, 8) * span).tolist()),
+        *(Course(driver, "ramp", (t,)) for t in np.quantile(since, _RAMPS).tolist()),
         *(Course(driver, "periodic", (period,)) for period in periods.tolist()),
         *(
             Course(driver, "settling", (start, tau))
-            for start in (np.linspace(0.1, 0.7, 7) * span).tolist()
+            for start in np.quantile(since, _EVENTS).tolist()
             for tau in lags[2::2]
         ),
     ]
@@ -210,8 +212,25 @@ def _recorded(driver: str, channels: Channels) -> np.ndarray:
     return np.asarray(channels.values[channels.index(driver)])
 
 
+def _reference(driver: str, channels: Channels) -> float:
+    """Mean of a driver over the epochs, from which centred forms count.
+
+    Where recordings were joined, that of the first: a further one, made to look into an effect,
+    does not change the state that the effect is counted from.
+    """
+    values = np.array(np.interp(channels.epoch_time, channels.time, _recorded(driver, channels)))
+    if SESSION in channels.names:
+        since = np.interp(channels.epoch_time, channels.time, _recorded(SESSION, channels))
+        values = values[: 1 + int(np.argmax(np.append(np.diff(since) < 0.0, True)))]
+    return float(np.mean(values))
+
+
 def _span(channels: Channels) -> float:
-    return float(channels.epoch_time[-1] - channels.epoch_time[0])
+    """Length of the longest session (s): no lag or period is known from the pause between two."""
+    if SESSION not in channels.names:
+        return float(channels.epoch_time[-1] - channels.epoch_time[0])
+    since = np.interp(channels.epoch_time, channels.time, _recorded(SESSION, channels))
+    return float(np.max(since))
 
 
 def _spacing(channels: Channels) -> float:

@@ -198,7 +198,7 @@ def free_unknowns(scene: Scene) -> Unknowns:
             release(slots, [f"rangefinder {finder.name}: {p}" for p in pose_parts])
     links = layout.all("link")
     release(links, [f"link {k // 6}: {pose_parts[k % 6]}" for k in range(len(links))])
-    idle = _release_effects(scene, layout, release, factor)
+    idle = _release_effects(scene, layout, release, factor, tie)
     group = local_groups(layout, {"epochs": by_epoch, "points": by_point}, free)
     momentary = np.flatnonzero(free & (by_epoch >= 0))
     momentary = np.append(momentary, layout.all("amplitude")[_amplitudes_of_one_epoch(scene)])
@@ -216,7 +216,7 @@ def _amplitudes_of_one_epoch(scene: Scene) -> np.ndarray:
     return np.array(own, int)
 
 
-def _release_effects(scene: Scene, layout: Layout, release, factor) -> np.ndarray:
+def _release_effects(scene: Scene, layout: Layout, release, factor, tie) -> np.ndarray:
     """Give every column and constant an unknown; returns the positions that stay idle.
 
     Spare columns and constants that can't be refined have an unknown too, so that the sizes of a
@@ -227,9 +227,13 @@ def _release_effects(scene: Scene, layout: Layout, release, factor) -> np.ndarra
     release(constant, ["spare constant"] * len(constant))
     busy = np.zeros(layout.size, bool)
     column, first = 0, 0
+    owner: dict[str, int] = {}
     for effect in scene.effects:
         form = FORMS[effect.form]
         n, m = effect.n_columns, len(effect.constants)
+        owner.setdefault(effect.name, first)
+        if effect.shares in owner:
+            tie[constant[first : first + m]] = constant[owner[effect.shares] + np.arange(m)]
         release(amplitude[column : column + n], [f"{effect.name}: amplitude"] * n)
         release(
             constant[first : first + m],

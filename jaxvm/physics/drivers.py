@@ -69,6 +69,9 @@ PLANE_BASES = ("tile", "sine", "cosine")
 OWN_BODY, OWN_POWER_ON = "own_body_degC", "time since own power-on"
 """Drivers that each camera has for itself."""
 
+SESSION = "time since the session's start"
+"""Driver of recordings with several sessions."""
+
 OBSERVATION_DRIVER_INDEX = {name: i for i, name in enumerate(OBSERVATION_DRIVERS)}
 
 
@@ -275,7 +278,7 @@ def build_channels(
         name = "time" if timed else "order"
         rows[name] = (name, grid - epoch_time[0])
     if timed and len(sessions) > 1:
-        rows["time since the session's start"] = ("time", _since(grid, sessions))
+        rows[SESSION] = ("time", _since(grid, sessions))
     rows |= {
         f"time since power-on of {camera}": ("power-on", _since(grid, own))
         for camera, own in moments.items()

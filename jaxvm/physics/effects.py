@@ -75,6 +75,7 @@ class Effect:
             the driver.
         catalogue_id: entry of the catalogue, "" where it has no name.
         spread: prior standard deviation of every amplitude; 0 for that of its port.
+        shares: name of the effect before it whose constants it shares; "" where it has its own.
     """
 
     name: str
@@ -87,6 +88,7 @@ class Effect:
     amplitudes: tuple[float, ...] = ()
     catalogue_id: str = ""
     spread: float = 0.0
+    shares: str = ""
 
     @property
     def n_columns(self) -> int:
@@ -104,6 +106,7 @@ class Effect:
             "name": self.name,
             "catalogue_id": self.catalogue_id,
             "spread": float(self.spread),
+            "shares": self.shares,
             "terms": terms,
             "driver": self.driver,
             "form": self.form,
@@ -155,10 +158,6 @@ class Channels(eqx.Module):
             known = ", ".join(self.names)
             raise KeyError(f'there is no driver "{name}" in this recording (it has: {known})')
         return self.names.index(name)
-
-    def mean(self, name: str) -> float:
-        """Mean of a channel over the epochs, the reference of centred forms."""
-        return float(np.mean(np.interp(self.epoch_time, self.time, self.values[self.index(name)])))
 
 
 class EffectTable(eqx.Module):

@@ -101,7 +101,7 @@ def parse_model(table: dict[str, Any], text: str = "") -> Model:
     )
     _forbid_one_place(root, model)
     priors = tuple(_prior(entry, model) for entry in root.listed("priors"))
-    effects = tuple(_effect(entry, model) for entry in root.listed("effects"))
+    effects = _effects(root, model)
     return replace(model, priors=priors, effects=effects)
 
 
@@ -326,9 +326,25 @@ def _closure(entry: Entry) -> Closure:
     return Closure(links, entry.positive("sigma_rad", 1e-9), entry.positive("sigma_m", 1e-9))
 
 
+def _effects(root: Entry, model: Model) -> tuple[Effect, ...]:
+    known: dict[str, int] = {}
+    found = []
+    for entry in root.listed("effects"):
+        effect = _effect(entry, model)
+        if effect.shares and known.get(effect.shares) != len(effect.constants):
+            entry.fail(
+                "shares",
+                f'{entry.title("shares")} is "{effect.shares}"; no effect before it has that name '
+                "and as many constants",
+            )
+        known.setdefault(effect.name, len(effect.constants))
+        found.append(effect)
+    return tuple(found)
+
+
 def _effect(entry: Entry, model: Model) -> Effect:
     keys = ("name", "catalogue_id", "driver", "form", "constants", "reference", "scope", "terms",
-            "amplitudes", "spread")  # fmt: skip
+            "amplitudes", "spread", "shares")  # fmt: skip
     entry.only(keys)
     for key, example in (("terms", '[{port = "target.bow_x"}]'), ("amplitudes", "[0.001]")):
         entry.needs(key, example)
@@ -351,6 +367,7 @@ def _effect(entry: Entry, model: Model) -> Effect:
         amplitudes=tuple(amplitudes.tolist()),
         catalogue_id=entry.string("catalogue_id", ""),
         spread=entry.number("spread", 0.0) or 0.0,
+        shares=entry.string("shares", ""),
     )
 
 

@@ -84,6 +84,8 @@ class Scene:
         path: trajectory of the moving target where it is fast, or None.
         weather: the conditions, see heat.Weather.
         sigma_px, sigma_m: noise of a pixel coordinate and of a range.
+        tells_power: whether the engineer noted when cameras were switched on.
+        restart_s: when all cameras were switched on again, or None.
     """
 
     kind: str
@@ -104,4 +106,5 @@ class Scene:
     weather: Any = None
     priors: list[dict] = field(default_factory=list)
     tells_power: bool = False
+    restart_s: float | None = None
     with_finder: bool = False

@@ -290,6 +290,7 @@ def _field_scene(
         sigma_m=float(rng.choice([2e-4, 5e-4, 1e-3])),
         priors=priors,
         tells_power=bool(rng.random() < 0.6),
+        restart_s=None if off is None else off[1],
     )
     weather = stream(kind, seed, "weather")
     style = "room" if kind == "stereo" and rng.random() < 0.5 else style

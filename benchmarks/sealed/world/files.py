@@ -52,7 +52,8 @@ def _camera(scene, camera):
     free = ", ".join(f'"{name}"' for name in known.get("free", []))
     lines += [_pose(camera), f"free = [{free}]"]
     if scene.tells_power:
-        lines += [f"powered_on_s = {camera.on_s:.1f}"]
+        again = [] if scene.restart_s is None else [f"{scene.restart_s:.1f}"]
+        lines += [f"powered_on_s = [{', '.join([f'{camera.on_s:.1f}', *again])}]"]
     return lines
 
 

@@ -132,6 +132,7 @@ def _bench(kind, seed, plan, size, rng, camera, layout, distances, fill_tilt, lo
         sigma_px=sigma,
         sigma_m=1e-3,
         tells_power=tells,
+        restart_s=None if break_s is None else break_s[1],
         priors=priors,
     )
     weather = stream(kind, seed, "weather")

@@ -1,0 +1,141 @@
+"""One step: constants and gains of drift models refined through the residual of the network.
+
+A model of time constants is a list of effects: every input at once and behind every lag, on all
+ports of a camera. They are adjusted together with everything that is free, with the noise of the
+pixels. Lags of one camera share their time constants; means, and the states that lags begin with,
+are nuisance effects and are dropped afterwards.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxvm.identify.gains import LOOSE
+from jaxvm.identify.inputs import POWER, Inputs
+from jaxvm.identify.lags import Lags, regressors
+from jaxvm.identify.model import CameraDrift
+from jaxvm.identify.trajectories import CAMERA_PORTS
+from jaxvm.network.scene import build
+from jaxvm.physics.effects import Effect, Scope, Term
+from jaxvm.recording import Drivers, Recording
+from jaxvm.solve.adjust import Adjustment, adjust
+from jaxvm.solve.covariance import standard_deviations
+
+
+def refined(plain: Adjustment, drifts: list[CameraDrift], inputs: Inputs) -> list[CameraDrift]:
+    """The drift models of all cameras, adjusted together.
+
+    Models in discrete time, and static parabolas, are no effects of the network; they stay as they
+    are.
+    """
+    chosen = [d for d in drifts if isinstance(d.dynamics, Lags) and d.dynamics.structure.power == 1]
+    if not chosen:
+        return drifts
+    recording = plain.scene.recording
+    effects: list[Effect] = []
+    for drift in chosen:
+        assert isinstance(drift.dynamics, Lags)
+        recording = _with_late_channels(recording, drift.dynamics)
+        effects += _effects(drift, inputs.only(drift.dynamics.inputs).ranges())
+    scene = replace(build(recording, ()), state=plain.scene.state)
+    scene = scene.with_effects((*recording.model.effects, *effects))
+    found = adjust(scene, check=False, repeats=0)
+    if found.failed:
+        return drifts
+    deviations = standard_deviations(found, found.variance_factor)
+    sigma = np.asarray(deviations.amplitude), np.asarray(deviations.constant)
+    names = [effect.name for effect in found.scene.effects]
+    fitted = dict(zip(names, found.scene.fitted_effects(), strict=True))
+    places = dict(zip(names, found.scene.places(), strict=True))
+    better = {}
+    for drift in chosen:
+        better[drift.camera] = _read_back(drift, inputs, fitted, places, sigma)
+    return [better.get(drift.camera, drift) for drift in drifts]
+
+
+def _late(name: str, delay: float) -> str:
+    return name if delay == 0.0 or name.startswith(POWER) else f"{name} {delay:.1f} s late"
+
+
+def _with_late_channels(recording: Recording, model: Lags) -> Recording:
+    """The recording with delayed inputs as channels of their own."""
+    if model.delay == 0.0 or recording.drivers is None:
+        return recording
+    time, channels = recording.drivers.time, dict(recording.drivers.channels)
+    for name in model.inputs:
+        if name in channels:
+            channels[_late(name, model.delay)] = np.interp(time - model.delay, time, channels[name])
+    return replace(recording, drivers=Drivers(time, channels))
+
+
+def _effects(drift: CameraDrift, ranges: Float[np.ndarray, " inputs"]) -> list[Effect]:
+    """Effects in the order of the regressors, then the nuisance ones."""
+    model = drift.dynamics
+    assert isinstance(model, Lags)
+    scope = Scope(camera=(drift.camera,))
+    # Amplitudes count in large drifts, so that one width serves all ports.
+    sizes = np.array([CAMERA_PORTS[port] for port in drift.ports])
+    terms = tuple(Term(port, weight=size) for port, size in zip(drift.ports, sizes, strict=True))
+    found: list[Effect] = []
+    gain = iter(model.gain.T)
+
+    def add(name, driver, form, constants=(), reference=0.0, of="", values=None, spread=1.0):
+        own = np.zeros(len(terms)) if values is None else values / sizes
+        if form == "lag with state":
+            own = np.column_stack([own, 0.0 * own]).ravel()
+        found.append(
+            Effect(f"{drift.camera}: {name}", terms, driver, form, constants, reference, scope,
+                   tuple(own), spread=spread, shares=of)
+        )  # fmt: skip
+
+    inputs = list(zip(model.inputs, model.reference, LOOSE / ranges, strict=True))
+    for name, reference, spread in inputs:
+        if name.startswith(POWER):
+            add(name, name, "step", (0.0,), values=next(gain), spread=spread)
+        else:
+            driver = _late(name, model.delay)
+            add(name, driver, "linear", (), reference, values=next(gain), spread=spread)
+    for k, tau in enumerate(model.tau):
+        first, begun = "", False
+        for name, reference, spread in inputs:
+            own, constants = f"{name}, lag {k + 1}", (float(tau),)
+            if name.startswith(POWER):
+                add(own, name, "onset", constants, 0.0, first, next(gain), spread)
+            else:
+                form = "lag" if begun else "lag with state"
+                driver, begun = _late(name, model.delay), True
+                add(own, driver, form, constants, reference, first, next(gain), spread)
+            first = first or f"{drift.camera}: {own}"
+    add("mean", "constant", "constant", spread=10.0)
+    return found
+
+
+def _read_back(drift: CameraDrift, inputs: Inputs, fitted, places, sigma) -> CameraDrift:
+    model = drift.dynamics
+    assert isinstance(model, Lags)
+    names = [f"{drift.camera}: {name}" for name in model.inputs]
+    lagged = [f"{drift.camera}: {name}, lag {k + 1}" for k in range(len(model.tau))
+              for name in model.inputs]  # fmt: skip
+    names += lagged
+    heads = lagged[:: len(model.inputs)]
+
+    def first_of(name: str, values) -> np.ndarray:
+        """Values of the first basis of every port; the second is a state."""
+        every = 2 if fitted[name].form == "lag with state" else 1
+        return np.asarray(values)[::every] * [CAMERA_PORTS[port] for port in drift.ports]
+
+    gain = np.array([first_of(name, fitted[name].amplitudes) for name in names]).T
+    spread = np.array([first_of(name, sigma[0][places[name][0]]) for name in names]).T
+    tau = np.array([fitted[name].constants[0] for name in heads])
+    tau_sigma = np.array([sigma[1][places[name][1]][0] for name in heads])
+    order = np.argsort(tau)
+    m = len(model.inputs)
+    columns = np.concatenate([np.arange(m), *(m + m * k + np.arange(m) for k in order)]).astype(int)
+    own = inputs.only(model.inputs)
+    centre = regressors(own, model.reference, model.structure, tau[order], model.delay).mean(axis=0)
+    return replace(
+        drift,
+        dynamics=replace(model, tau=tau[order], tau_sigma=tau_sigma[order], gain=gain[:, columns],
+                         gain_sigma=spread[:, columns], centre=centre),
+    )  # fmt: skip

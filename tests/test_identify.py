@@ -1,0 +1,382 @@
+"""Identification and compensation: known systems, scipy's solutions, streams, files, bad input."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.signal import lfilter, lsim
+
+from jaxvm.identify import Compensator, DriftModel, compensate, identify, read_drift_model
+from jaxvm.identify.difference import Orders, fit_difference
+from jaxvm.identify.identify import CONTINUOUS, DISCRETE, _choice
+from jaxvm.identify.inputs import POWER, Inputs, inputs_of
+from jaxvm.identify.lags import Structure, fit, regressors
+from jaxvm.identify.model import CameraDrift, Trained
+from jaxvm.identify.poses import image_poses
+from jaxvm.identify.trajectories import trajectories
+from jaxvm.network.residual import predict_pixels
+from jaxvm.network.scene import build
+from jaxvm.physics.effects import Effect, Scope, Term
+from jaxvm.recording import Drivers, Observations, Recording
+from jaxvm.recording.model import Camera, Model, Station, Target
+from jaxvm.solve.adjust import adjust
+
+HOURS, STEP = 10.0, 120.0
+STILL = np.zeros(6)
+
+
+def weather(time: np.ndarray, seed: int = 0) -> np.ndarray:
+    """Steps and ramps of the air (degC) between 12 and 30."""
+    rng = np.random.default_rng(seed)
+    knots = np.sort(rng.uniform(time[0], time[-1], 24))
+    return np.interp(time, knots, rng.uniform(12.0, 30.0, 24))
+
+
+def made_inputs(seed: int = 0, on: float = 1800.0) -> Inputs:
+    log = np.arange(-3600.0, 3600.0 * HOURS + 61.0, 60.0)
+    epochs = np.arange(0.0, 3600.0 * HOURS + 1.0, STEP)
+    time = np.unique(np.concatenate([log, epochs]))
+    values = np.stack([weather(time, seed), time - on])
+    return Inputs(("ambient_degC", POWER + "left"), time, values, np.searchsorted(time, epochs))
+
+
+def outputs(inputs: Inputs, taus=(600.0, 3000.0), seed: int = 0, noise: float = 1.0):
+    """Three outputs of known gains on the lags of both inputs."""
+    rng = np.random.default_rng(seed)
+    reference = np.array([20.0, 0.0])
+    found = regressors(inputs, reference, Structure(len(taus)), np.array(taus), 0.0)
+    gain = rng.normal(size=(3, found.shape[1])) * [30.0, 0.0, *[60.0, 800.0] * len(taus)]
+    clean = (found - found.mean(axis=0)) @ gain.T
+    return clean, clean + noise * rng.normal(size=clean.shape)
+
+
+BLOCKS = np.arange(301) // 5 % 5
+LARGE = np.full(3, 2000.0)
+
+
+def test_a_lag_is_scipys_response_of_a_first_order_system():
+    inputs = made_inputs()
+    found = regressors(inputs, np.zeros(2), Structure(1), np.array([900.0]), 0.0)
+    x = inputs.values[0]
+    # lsim interpolates linearly as well, but wants equal steps.
+    time = np.arange(inputs.time[0], inputs.time[-1], 20.0)
+    drive = np.interp(time, inputs.time, x) - x[0]
+    _, expected, _ = lsim(([1.0], [900.0, 1.0]), drive, time - time[0])
+    at = inputs.time[inputs.epoch]
+    np.testing.assert_allclose(found[:, 2], x[0] + np.interp(at, time, expected), atol=0.03)
+    since = np.maximum(at - 1800.0, 0.0)
+    np.testing.assert_allclose(found[:, 3], 1.0 - np.exp(-since / 900.0), atol=1e-12)
+
+
+def test_time_constants_and_outputs_are_recovered_within_their_deviations():
+    inputs = made_inputs()
+    clean, noisy = outputs(inputs)
+    found = fit(inputs, noisy, np.ones_like(noisy), Structure(2), BLOCKS, LARGE)
+    z = (found.model.tau - [600.0, 3000.0]) / found.model.tau_sigma
+    assert np.all(np.abs(z) < 4.0), (found.model.tau, found.model.tau_sigma)
+    left = np.sqrt(np.mean((found.courses - clean) ** 2))
+    assert left < 0.4  # noise 1, 3 x 13 unknowns over 3 x 301 numbers: 0.21 expected
+    chi = found.chi.sum() / (noisy.size - found.unknowns)
+    assert abs(chi - 1.0) < 4.0 * np.sqrt(2.0 / noisy.size)
+
+
+def test_a_model_foretells_another_history_that_it_has_never_seen():
+    inputs, other = made_inputs(0), made_inputs(5, on=-600.0)
+    _, noisy = outputs(inputs)
+    found = fit(inputs, noisy, np.ones_like(noisy), Structure(2), BLOCKS, LARGE)
+    reference = np.array([20.0, 0.0])
+    rng = np.random.default_rng(0)
+    rows = regressors(other, reference, Structure(2), np.array([600.0, 3000.0]), 0.0)
+    gain = rng.normal(size=(3, 6)) * [30.0, 0.0, 60.0, 800.0, 60.0, 800.0]
+    own = regressors(inputs, reference, Structure(2), np.array([600.0, 3000.0]), 0.0)
+    truth = (rows - own.mean(axis=0)) @ gain.T
+    left = found.model.response(other) - truth
+    assert np.sqrt(np.mean(left**2)) < 0.01 * np.sqrt(np.mean(truth**2))
+
+
+def test_a_delay_is_recovered():
+    inputs = made_inputs()
+    late = regressors(inputs, np.array([20.0, 0.0]), Structure(1, delayed=True), [600.0], 900.0)
+    z = np.outer(late[:, 2], [50.0, -20.0, 10.0])
+    z += np.random.default_rng(1).normal(size=z.shape)
+    z -= z.mean(axis=0)
+    found = fit(inputs, z, np.ones_like(z), Structure(1, delayed=True), BLOCKS, LARGE).model
+    assert abs(found.delay - 900.0) < 3.0 * found.delay_sigma < 150.0
+    assert abs(found.tau[0] - 600.0) < 4.0 * found.tau_sigma[0]
+
+
+@settings(max_examples=12, deadline=None)
+@given(st.floats(300.0, 5000.0), st.integers(0, 10**6))
+def test_the_chosen_order_is_that_of_the_system(tau, seed):
+    inputs = made_inputs(seed)
+    _, one = outputs(inputs, (tau,), seed)
+    fits = [fit(inputs, one, np.ones_like(one), s, BLOCKS, LARGE) for s in CONTINUOUS[::2]]
+    assert [s.order for s in CONTINUOUS[::2]] == [0, 1, 2]
+    assert _choice(fits)[0] == 1
+
+
+def test_equation_error_is_biased_by_noise_and_output_error_is_not():
+    """A first-order lag sampled every 120 s has its pole at exp(-120 / tau)."""
+    inputs = made_inputs(3)
+    pole = np.exp(-STEP / 900.0)
+    u = inputs.values[0][inputs.epoch] - 20.0
+    y = lfilter([1.0 - pole], [1.0, -pole], u, zi=[pole * u[0]])[0]
+    z = np.outer(y, [3.0, -2.0, 1.0])
+    z += np.random.default_rng(2).normal(size=z.shape)
+    z -= z.mean(axis=0)
+    own = inputs.only(("ambient_degC",))
+    poles = {}
+    for kind in ("ARX", "output error"):
+        found = fit_difference(own, z, np.ones_like(z), Orders(kind, 1, 1), BLOCKS, LARGE).model
+        poles[kind] = -found.a[0]
+    assert abs(poles["output error"] - pole) < 0.004
+    assert poles["ARX"] < pole - 0.02
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(1, 3), st.integers(0, 10**6))
+def test_models_are_stable_whatever_the_data(order, seed):
+    inputs = made_inputs(seed % 7)
+    rng = np.random.default_rng(seed)
+    z = np.cumsum(rng.normal(size=(301, 3)), axis=0) * np.linspace(0.1, 10.0, 301)[:, None]
+    z -= z.mean(axis=0)
+    for kind in ("ARX", "output error"):
+        found = fit_difference(inputs, z, np.ones_like(z), Orders(kind, order, 2), BLOCKS, LARGE)
+        assert np.all(np.abs(np.roots(np.append(1.0, found.model.a))) < 1.0)
+        assert np.all(np.isfinite(found.model.response(inputs)))
+
+
+def test_the_table_of_forgotten_lags():
+    """MATHEMATICS 1.5: a static model leaves wt / sqrt(1 + w^2 t^2) of the response."""
+    table = {86400.0: (0.022, 0.044, 0.087, 0.172, 0.366),
+             21600.0: (0.087, 0.172, 0.330, 0.572, 0.844),
+             3600.0: (0.464, 0.723, 0.902, 0.973, 0.994)}  # fmt: skip
+    for period, shares in table.items():
+        epochs = np.linspace(0.0, 4.0 * period, 801)[:-1]
+        log = np.concatenate([np.linspace(-12.0 * 5400.0, -1.0, 4000), epochs])
+        x = np.sin(2.0 * np.pi * log / period)[None]
+        inputs = Inputs(("ambient_degC",), log, x, np.arange(4000, 4800))
+        for minutes, share in zip((5, 10, 20, 40, 90), shares, strict=True):
+            one = np.array([60.0 * minutes])
+            y = regressors(inputs, np.zeros(1), Structure(1), one, 0.0)[:, 1]
+            static = np.linalg.lstsq(np.stack([x[0, 4000:], np.ones(800)]).T, y, rcond=None)[1]
+            left = np.sqrt(static[0] / np.sum((y - y.mean()) ** 2))
+            assert left == pytest.approx(share, abs=6e-4)
+
+
+# --- recordings ----------------------------------------------------------------------------------
+
+
+def a_recording(effects=(), seed: int = 1, hours: float = 10.0, noise: int = 0) -> Recording:
+    """A camera that watches a tilted plate while the air changes; images by the chain."""
+    time, sigma = np.arange(0.0, 3600.0 * hours, 180.0), 0.03
+    log = np.arange(-3600.0, time[-1] + 61.0, 60.0)
+    names = tuple(f"{r}/{c}" for r in range(4) for c in range(5))
+    points = np.array([[0.1 * c, 0.1 * r, 0.0] for r in range(4) for c in range(5)])
+    camera = Camera("left", "pillar", (2448, 2048), "opencv4", np.array([5000.0, 5000.0]),
+                    np.array([1223.5, 1023.5]), np.array([-0.08, 0.02, 0.0, 0.0]), STILL,
+                    powered_on_s=(900.0,))  # fmt: skip
+    pose = np.array([0.4, 0.3, 0.0, -0.15, -0.12, 1.6])
+    model = Model(
+        "",
+        (camera,),
+        (Station("pillar", pose=STILL),),
+        (Target("plate", names, points, pose=pose, free=frozenset({"pose"})),),
+        pixel_sigma=sigma,
+    )
+    epoch, point = (a.ravel() for a in np.indices((len(time), len(names))))
+    none = np.zeros(len(epoch), int)
+    empty = Observations(epoch, none, none, point, np.zeros((len(epoch), 2)),
+                         np.full(len(epoch), sigma))  # fmt: skip
+    recording = Recording(model, np.arange(len(time)), time, {}, empty,
+                          Drivers(log, {"ambient_degC": weather(log, seed)}))  # fmt: skip
+    scene = build(recording, tuple(effects))
+    pixel = np.zeros((len(epoch), 2))
+    for rows, own in zip(scene.tables, predict_pixels(scene.state, scene.network), strict=True):
+        pixel[rows] = np.asarray(own)[: len(rows)]
+    pixel += sigma * np.random.default_rng([seed, noise]).normal(size=pixel.shape)
+    return replace(recording, observations=replace(empty, pixel=pixel))
+
+
+SCOPE = Scope(camera=("left",))
+DRIFT = (
+    Effect("focal", (Term("sensor.focal"), Term("mount.turn_x")), "ambient_degC", "lag", (1500.0,),
+           20.0, SCOPE, (30e-6, 10e-6)),
+    Effect("mount", (Term("mount.turn_y"),), "time since power-on of left", "onset", (1500.0,), 0.0,
+           SCOPE, (2e-4,)),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def identified():
+    return identify(a_recording(DRIFT), CONTINUOUS[:3])
+
+
+def test_a_camera_is_identified_through_the_residual(identified):
+    (own,) = identified.cameras
+    assert own.fit.model.structure.name == "1 time constant"
+    assert abs(own.drift.dynamics.tau[0] - 1500.0) < 4.0 * own.drift.dynamics.tau_sigma[0] < 100.0
+    lasting = own.drift.lasting()
+    # Focal length and distortion look alike here; what they do to the image together is sure.
+    assert lasting["sensor.focal"]["ambient_degC"] == pytest.approx(30e-6, rel=0.1)
+    assert "held: " in own.trajectories.gauge()
+    assert own.drift.held_out_px < 0.1 * own.drift.drift_px
+
+
+def test_two_steps_agree_with_one(identified):
+    two = identify(a_recording(DRIFT), CONTINUOUS[:3], one_step=False)
+    a, b = (one.cameras[0].drift.dynamics for one in (two, identified))
+    assert abs(a.tau[0] - b.tau[0]) < 2.0 * b.tau_sigma[0]
+    other = a_recording(DRIFT, seed=4)
+    first, second = (compensate(other, one.model).correction for one in (two, identified))
+    assert np.std(first - second) < 0.02 * np.std(second)
+
+
+def test_compensation_of_another_day(identified):
+    other = a_recording(DRIFT, seed=8)
+    still = a_recording((), seed=8)  # the same noise, no drift
+    done = compensate(other, identified.model)
+    before = other.observations.pixel - still.observations.pixel
+    after = done.recording.observations.pixel - still.observations.pixel
+
+    def about_mean(x):
+        """Of every mark, from its mean state."""
+        return x.reshape(200, 20, 2) - x.reshape(200, 20, 2).mean(axis=0)
+
+    assert np.std(about_mean(after)) < 0.02 * np.std(about_mean(before))
+    poses = [image_poses(r) for r in (still, other, done.recording)]
+    depth = [table["shift_z"].to_numpy() for table in poses]
+    assert np.std(depth[2] - depth[0]) < 0.2 * np.std(depth[1] - depth[0])
+    assert list(poses[0]["camera"].unique()) == ["left"]
+
+
+def test_a_model_survives_its_file(identified, tmp_path):
+    file = tmp_path / "drift.toml"
+    file.write_text(identified.model.text())
+    again = read_drift_model(file)
+    other = a_recording(DRIFT, seed=8)
+    np.testing.assert_array_equal(
+        compensate(other, again).correction, compensate(other, identified.model).correction
+    )
+    file.write_text(file.read_text().replace("tau_s", "tua_s"))
+    with pytest.raises(ValueError, match="drift.toml: camera .left.: .tau_s. is missing"):
+        read_drift_model(file)
+    file.write_text("format = 1")
+    with pytest.raises(ValueError, match="no drift model"):
+        read_drift_model(file)
+
+
+@pytest.mark.parametrize("structure", [CONTINUOUS[2], CONTINUOUS[3], DISCRETE[0], DISCRETE[2]])
+def test_a_stream_of_frames_is_the_recording(structure):
+    recording = a_recording(DRIFT)
+    found = identify(recording, [structure], one_step=False)
+    other = a_recording(DRIFT, seed=8)
+    batch = compensate(other, found.model).recording.observations
+    inputs, obs = inputs_of(other), other.observations
+    drift = found.model.cameras[0]
+    if drift.dynamics.structure.name.endswith("delayed"):
+        drift = replace(drift, dynamics=replace(drift.dynamics, delay=250.0))
+        batch = compensate(other, DriftModel((drift,))).recording.observations
+    stream = Compensator(other.model.cameras[0], drift)
+    start = inputs.time[inputs.epoch[0]]
+    step = getattr(drift.dynamics, "step", None)
+    for k, time in enumerate(inputs.time):
+        if step and time < start - int((start - inputs.time[0]) / step) * step - 1e-9:
+            continue  # the first reading of a difference equation is one of its steps
+        readings = dict(zip(inputs.names, inputs.values[:, k], strict=True))
+        stream.read(float(time), readings)
+        for epoch in np.flatnonzero(inputs.epoch == k):
+            own = obs.epoch == epoch
+            np.testing.assert_allclose(
+                stream.correct(obs.pixel[own]), batch.pixel[own], rtol=0, atol=1e-9
+            )
+
+
+def test_extrapolation_is_flagged(identified):
+    other = a_recording(DRIFT, seed=8)
+    assert other.drivers is not None
+    hot = {name: values + 15.0 for name, values in other.drivers.channels.items()}
+    done = compensate(replace(other, drivers=Drivers(other.drivers.time, hot)), identified.model)
+    assert done.outside.mean() > 0.3
+    assert any("outside the range" in text for text in done.warnings)
+    assert not compensate(a_recording(DRIFT), identified.model).outside.any()
+
+
+def test_trajectories_are_the_changes_that_were_made():
+    """Against the truth of the simulation, in the deviations that theory gives."""
+    a, b = (trajectories(adjust(build(a_recording(DRIFT, noise=n), ())), "left") for n in (0, 1))
+    assert a.ports == b.ports
+    noise = (a.port - b.port) / np.sqrt(2.0)
+    spread = np.sqrt(np.sum(a.ports_from_mode**2, axis=1))
+    assert np.all(np.abs(np.std(noise, axis=0) / spread - 1.0) < 0.25)
+    focal = a.port[:, a.ports.index("sensor.focal")]
+    log = inputs_of(a_recording(DRIFT))
+    truth = 30e-6 * regressors(log.only(("ambient_degC",)), [20.0], Structure(1), [1500.0], 0.0)
+    wrong = focal - (truth[:, 1] - truth[:, 1].mean())
+    assert np.std(wrong) < 1.2 * spread[a.ports.index("sensor.focal")]
+
+
+# --- bad input -----------------------------------------------------------------------------------
+
+
+def test_what_cannot_be_identified_is_said():
+    recording = a_recording()
+    with pytest.raises(ValueError, match="there are 10 epochs; record at least 24"):
+        identify(recording.select_epochs(np.arange(200) < 10))
+    assert recording.drivers is not None
+    camera = replace(recording.model.cameras[0], powered_on_s=())
+    dark = replace(recording, model=replace(recording.model, cameras=(camera,)))
+    with pytest.raises(ValueError, match="no drivers and no power-on; add drivers.csv"):
+        identify(replace(dark, drivers=None))
+    still = {"ambient_degC": np.full(len(recording.drivers.time), 21.0)}
+    with pytest.raises(ValueError, match="no temperature changes"):
+        identify(replace(dark, drivers=Drivers(recording.drivers.time, still)))
+    with pytest.raises(ValueError, match="have no times"):
+        identify(replace(recording, timed=False))
+
+
+def test_gaps_and_sensors_that_hang_are_told():
+    recording = a_recording()
+    assert recording.drivers is not None
+    time, air = recording.drivers.time, recording.drivers.channels["ambient_degC"]
+    kept = (time < 8000.0) | (time > 12000.0)
+    gap = replace(recording, drivers=Drivers(time[kept], {"ambient_degC": air[kept]}))
+    assert any("gap from 7980 s to 12060 s" in text for text in inputs_of(gap).warnings)
+    stuck = np.where(time > 15000.0, air[np.argmax(time > 15000.0)], air)
+    channels = {"ambient_degC": air, "body_left_degC": stuck}
+    hangs = replace(recording, drivers=Drivers(time, channels))
+    assert any("body_left_degC stays" in text for text in inputs_of(hangs).warnings)
+    assert not inputs_of(recording).warnings
+
+
+def test_a_clock_that_is_wrong_is_told():
+    """Temperatures that are logged twenty minutes late: images seem to be ahead of them."""
+    recording = a_recording(DRIFT)
+    assert recording.drivers is not None
+    drivers = recording.drivers
+    late = Drivers(drivers.time, {"ambient_degC": np.interp(drivers.time - 1200.0, drivers.time,
+                                                          weather(drivers.time, 1))})  # fmt: skip
+    found = identify(replace(recording, drivers=late), CONTINUOUS[:4])
+    (own,) = found.cameras
+    assert any("ahead of the log" in text for text in own.warnings), own.warnings
+    with pytest.raises(ValueError, match="set the clock of the log"):
+        Compensator(recording.model.cameras[0], own.drift)
+
+
+def test_a_foreign_camera_or_a_missing_input_is_told(identified):
+    other = a_recording()
+    (drift,) = identified.model.cameras
+    foreign = DriftModel((replace(drift, camera="right"),))
+    with pytest.raises(ValueError, match="the model is of right; the recording has left"):
+        compensate(other, foreign)
+    with pytest.raises(ValueError, match='driven by "ambient_degC", which this recording'):
+        compensate(replace(other, drivers=None), identified.model)
+    own = CameraDrift(drift.camera, drift.ports, drift.held, drift.dynamics, 1.0,
+                      {"ambient_degC": Trained(0.0, 1.0)}, 0.0, 1.0)  # fmt: skip
+    stream = Compensator(other.model.cameras[0], own)
+    with pytest.raises(ValueError, match="no reading of the inputs yet"):
+        stream.correct(np.zeros((1, 2)))
+    with pytest.raises(ValueError, match='has no "ambient_degC"'):
+        stream.read(0.0, {})
