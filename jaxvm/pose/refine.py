@@ -1,26 +1,28 @@
 """Maximum-likelihood pose from one image: Levenberg-Marquardt, many poses at once.
 
 The unknowns are a small turn w and shift d of the target as the camera sees it, X -> X + w x X + d.
-With x = X/Z, y = Y/Z the ideal image moves by
-
-    dx = dx/Z - x dz/Z - x y wx + (1 + x^2) wy - y wz,
-    dy = dy/Z - y dz/Z - (1 + y^2) wx + x y wy + x wz.
-
 All numbers are arrays with the poses last, so that one instruction works on several of them, and
 the six normal equations are written out: for systems this small, that is what limits the speed.
 """
 
+import os
+from concurrent.futures import ThreadPoolExecutor
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from jaxvm.geometry import so3_exp, so3_log
 from jaxvm.pose.sighting import Sighting
 
 _MOST = 30
-_BLOCK = 512
+_BLOCK = 256
 """Poses that are worked on together: their numbers stay in the cache of a processor."""
+
+_GAIN = 1e-7
+"""Gain in chi-square of a step that is the last."""
 
 
 class Refined(eqx.Module):
@@ -49,19 +51,51 @@ def refine(sighting: Sighting, start: Float[Array, "6"]) -> Refined:
     """
     with_lanes = jax.tree.map(lambda leaf: leaf[..., None], sighting)
     rotation = so3_exp(start[:3])[..., None]
-    found = _minimised(with_lanes, rotation, start[3:, None])
-    return _result(jax.tree.map(lambda leaf: leaf[..., 0], found))
+    found = _result(_minimised(with_lanes, rotation, start[3:, None]))
+    return jax.tree.map(lambda leaf: leaf[..., 0], found)
 
 
-@eqx.filter_jit
 def refine_many(sightings: Sighting, starts: Float[Array, "b 6"]) -> Refined:
     """Maximum-likelihood poses of many sightings, in blocks that stay in cache.
+
+    Outside of `jax.jit` each core works on its own share.
 
     Args:
         sightings: with the poses first: points [b, n, 3] or [n, 3], image [b, n, 2], whitener
             [b, n, 2, 2] or [n, 2, 2].
         starts: camera_from_target as (turn, shift).
     """
+    count, cores = len(starts), os.cpu_count() or 1
+    leaves = _leaves(sightings)
+    if isinstance(starts, Tracer) or any(isinstance(leaf, Tracer) for leaf in leaves):
+        return _in_blocks(sightings, starts)
+    # Equal shares are one compiled program; the last one may overlap the one before.
+    size = min(-(-count // (cores * _BLOCK)) * _BLOCK, count)
+    firsts = [min(first, count - size) for first in range(0, count, size)]
+    if len(firsts) == 1:
+        return _in_blocks(sightings, starts)
+    with ThreadPoolExecutor(cores) as pool:
+        parts = pool.map(
+            lambda first: jax.block_until_ready(_share(sightings, starts, first, size)), firsts
+        )
+        found = list(parts)
+    fresh = firsts[-1] - firsts[-2]
+    found[-1] = jax.tree.map(lambda leaf: leaf[size - fresh :], found[-1])
+    return jax.tree.map(lambda *each: jnp.concatenate(each), *found)
+
+
+@eqx.filter_jit
+def _share(sightings: Sighting, starts: Float[Array, "b 6"], first, size: int) -> Refined:
+    """The poses from `first` on, as many as `size`."""
+    leaves = [
+        leaf if leaf.ndim == k else jax.lax.dynamic_slice_in_dim(leaf, first, size)
+        for leaf, k in zip(_leaves(sightings), (2, 2, 3), strict=True)
+    ]
+    return _in_blocks(Sighting(*leaves), jax.lax.dynamic_slice_in_dim(starts, first, size))
+
+
+@eqx.filter_jit
+def _in_blocks(sightings: Sighting, starts: Float[Array, "b 6"]) -> Refined:
     count = len(starts)
     block = min(_BLOCK, count)
     n_blocks = -(-count // block)
@@ -81,21 +115,36 @@ def refine_many(sightings: Sighting, starts: Float[Array, "b 6"]) -> Refined:
             leaf[..., None] if one is None else one
             for leaf, one in zip(_leaves(sightings), given, strict=True)
         ]
-        return _minimised(Sighting(*leaves), rotation, shift)
+        return _result(_minimised(Sighting(*leaves), rotation, shift))
 
     found = jax.lax.map(solve, (own, blocks(rotation), blocks(starts[:, 3:])))
-    found = jax.tree.map(
+    return jax.tree.map(
         lambda leaf: jnp.moveaxis(leaf, -1, 1).reshape(-1, *leaf.shape[1:-1])[:count], found
     )
-    return jax.vmap(_result)(found)
 
 
 def _leaves(sighting: Sighting) -> tuple[Array, Array, Array]:
     return sighting.points, sighting.image, sighting.whitener
 
 
+class _Marks(eqx.Module):
+    """Marks, their ideal images, and the weights W^T W = [[a, b], [b, c]] of these; lanes last."""
+
+    points: Float[Array, "n 3 b"]
+    image: Float[Array, "n 2 b"]
+    weight: tuple[Array, Array, Array]
+
+
+def _marks(sighting: Sighting) -> _Marks:
+    w = sighting.whitener
+    a = w[:, 0, 0] ** 2 + w[:, 1, 0] ** 2
+    b = w[:, 0, 0] * w[:, 0, 1] + w[:, 1, 0] * w[:, 1, 1]
+    c = w[:, 0, 1] ** 2 + w[:, 1, 1] ** 2
+    return _Marks(sighting.points, sighting.image, (a, b, c))
+
+
 class _State(eqx.Module):
-    """Where the poses stand; lanes last."""
+    """Where the poses stand, the system there, and the next step; lanes last."""
 
     rotation: Float[Array, "3 3 b"]
     shift: Float[Array, "3 b"]
@@ -103,42 +152,45 @@ class _State(eqx.Module):
     pull: Float[Array, "6 b"]
     hessian: Float[Array, "6 6 b"]
     damping: Float[Array, " b"]
+    change: Float[Array, "6 b"]
     done: Array
     iterations: Array
 
 
 def _result(state: _State) -> Refined:
-    vector = jnp.concatenate([so3_log(state.rotation), state.shift])
-    return Refined(vector, state.cost, jnp.linalg.inv(state.hessian), state.iterations)
+    """Poses and covariances, lanes last."""
+    turn = jax.vmap(so3_log, in_axes=-1, out_axes=-1)(state.rotation)
+    vector = jnp.concatenate([turn, state.shift])
+    unit = jnp.eye(6)[:, :, None] + 0.0 * state.cost
+    columns = [_solved(state.hessian, unit[k], 0.0) for k in range(6)]
+    return Refined(vector, state.cost, jnp.stack(columns), state.iterations)
 
 
 def _minimised(sighting: Sighting, rotation, shift) -> _State:
-    cost, pull, hessian = _system(sighting, rotation, shift)
-    state = _State(
-        rotation, shift, cost, pull, hessian,
-        damping=jnp.full_like(cost, 1e-6),
-        done=~jnp.isfinite(cost),
-        iterations=jnp.zeros_like(cost, dtype=int),
+    marks = _marks(sighting)
+    cost, pull, hessian = _system(marks, rotation, shift)
+    state = _planned(
+        _State(
+            rotation, shift, cost, pull, hessian,
+            damping=jnp.full_like(cost, 1e-6),
+            change=jnp.zeros_like(pull),
+            done=~jnp.isfinite(cost),
+            iterations=jnp.zeros_like(cost, dtype=int),
+        )
     )  # fmt: skip
     return jax.lax.while_loop(
         lambda s: ~jnp.all(s.done) & (jnp.max(s.iterations) < _MOST),
-        lambda s: _step(sighting, s),
+        lambda s: _planned(_step(marks, s)),
         state,
     )
 
 
-def _step(sighting: Sighting, s: _State) -> _State:
-    """One step of all poses; those that are done stay."""
-    change = _solved(s.hessian, -s.pull, s.damping)
-    turn = _small_rotation(change[:3])
-    rotation = _product(turn, s.rotation)
-    shift = _applied(turn, s.shift) + change[3:]
-    cost, pull, hessian = _system(sighting, rotation, shift)
+def _step(marks: _Marks, s: _State) -> _State:
+    """One step of all poses that are not done, taken where it makes the cost smaller."""
+    rotation, shift = _moved(s)
+    cost, pull, hessian = _system(marks, rotation, shift)
     better = cost <= s.cost
-    # What the next step could still gain: pull^T H^-1 pull, to first order.
-    gain = -jnp.sum(change * s.pull, axis=0)
-    still = (gain <= 1e-14 * s.cost + 1e-20) | ~jnp.isfinite(gain)
-    go, stop = better & ~s.done, s.done | still
+    go = better & ~s.done
     return _State(
         rotation=jnp.where(go, rotation, s.rotation),
         shift=jnp.where(go, shift, s.shift),
@@ -146,39 +198,86 @@ def _step(sighting: Sighting, s: _State) -> _State:
         pull=jnp.where(go, pull, s.pull),
         hessian=jnp.where(go, hessian, s.hessian),
         damping=jnp.where(better, 0.1 * s.damping, jnp.maximum(10.0 * s.damping, 1e-3)),
-        done=stop,
+        change=s.change,
+        done=s.done,
         iterations=s.iterations + ~s.done,
     )
 
 
-def _system(sighting: Sighting, rotation, shift):
-    """Chi-square, its half gradient and its Gauss-Newton matrix, over (turn, shift)."""
-    p, w = sighting.points, sighting.whitener
+def _planned(s: _State) -> _State:
+    """The next step of all poses; one that gains next to nothing is the last, and is not checked.
+
+    A step that gains g in chi-square moves a pose by at most sqrt(g) deviations, and Gauss and
+    Newton's error after it is smaller by orders.
+    """
+    change = _solved(s.hessian, -s.pull, s.damping)
+    gain = -jnp.sum(change * s.pull, axis=0)
+    last = ((gain <= _GAIN) | ~jnp.isfinite(gain)) & ~s.done
+    planned = eqx.tree_at(lambda s: s.change, s, change)
+    rotation, shift = _moved(planned)
+    go = last & jnp.isfinite(gain)
+    return eqx.tree_at(
+        lambda s: (s.rotation, s.shift, s.cost, s.done),
+        planned,
+        (
+            jnp.where(go, rotation, s.rotation),
+            jnp.where(go, shift, s.shift),
+            jnp.where(go, s.cost - gain, s.cost),
+            s.done | last,
+        ),
+    )
+
+
+def _moved(s: _State):
+    """Rotation and shift after the next step."""
+    turn = _small_rotation(s.change[:3])
+    return _product(turn, s.rotation), _applied(turn, s.shift) + s.change[3:]
+
+
+def _system(marks: _Marks, rotation, shift):
+    """Chi-square, its half gradient and its Gauss-Newton matrix, over (turn, shift).
+
+    With X = (x, y, 1) and J = [I, -(x, y)], a shift moves the ideal image by J d / Z and a turn by
+    J (w x X). So with M = J^T W^T W J the blocks of the matrix are M / Z^2, X x M / Z, and that
+    crossed with X once more.
+    """
+    p = marks.points
     x, y, z = (
         rotation[k, 0] * p[:, 0] + rotation[k, 1] * p[:, 1] + rotation[k, 2] * p[:, 2] + shift[k]
         for k in range(3)
     )
-    z = jnp.where(jnp.any(w != 0.0, axis=(1, 2)), z, 1.0)  # where it was seen
-    per_depth = 1.0 / z
-    x, y = x * per_depth, y * per_depth
-    dx, dy = x - sighting.image[:, 0], y - sighting.image[:, 1]
-    xy, zero = x * y, jnp.zeros_like(x)
-    of_x = (-xy, 1.0 + x * x, -y, per_depth, zero, -x * per_depth)
-    of_y = (-1.0 - y * y, xy, x, zero, per_depth, -y * per_depth)
-    first = [w[:, 0, 0] * a + w[:, 0, 1] * b for a, b in zip(of_x, of_y, strict=True)]
-    second = [w[:, 1, 0] * a + w[:, 1, 1] * b for a, b in zip(of_x, of_y, strict=True)]
-    e, f = w[:, 0, 0] * dx + w[:, 0, 1] * dy, w[:, 1, 0] * dx + w[:, 1, 1] * dy
+    a, b, c = marks.weight
+    z = jnp.where((a > 0.0) | (c > 0.0), z, 1.0)  # where it was seen
+    r = 1.0 / z
+    # 28 sums read these: they are computed once.
+    x, y, r = jax.lax.optimization_barrier((x * r, y * r, r))
+    dx, dy = x - marks.image[:, 0], y - marks.image[:, 1]
+    q, s = a * dx + b * dy, b * dx + c * dy
     # A mark behind the camera is no picture of anything.
-    cost = jnp.where(jnp.all(z > 0.0, axis=0), jnp.sum(e * e + f * f, axis=0), jnp.inf)
-    pull = jnp.stack([jnp.sum(a * e + b * f, axis=0) for a, b in zip(first, second, strict=True)])
-    rows = {}
-    for i in range(6):
-        for j in range(i + 1):
-            rows[i, j] = jnp.sum(first[i] * first[j] + second[i] * second[j], axis=0)
-    hessian = jnp.stack(
-        [jnp.stack([rows[max(i, j), min(i, j)] for j in range(6)]) for i in range(6)]
-    )
-    return cost, pull, hessian
+    cost = jnp.where(jnp.all(r > 0.0, axis=0), jnp.sum(dx * q + dy * s, axis=0), jnp.inf)
+
+    def cross(v):
+        """(x, y, 1) x v."""
+        return y * v[2] - v[1], v[0] - x * v[2], x * v[1] - y * v[0]
+
+    def total(value):
+        return jnp.sum(value, axis=0)
+
+    g, h = a * x + b * y, b * x + c * y
+    columns = (a, b, -g), (b, c, -h), (-g, -h, x * g + y * h)
+    force = q, s, -(x * q + y * s)
+    pull = [*map(total, cross(force)), *(total(r * f) for f in force)]
+    crossed = [cross(column) for column in columns]  # [shift][turn]
+    rows = [[pull[0]] * 6 for _ in range(6)]
+    for i in range(3):
+        of_turn = cross([crossed[k][i] for k in range(3)])
+        for j in range(3):
+            if j >= i:
+                rows[i][j] = rows[j][i] = total(of_turn[j])
+                shift_shift = total(r * r * columns[i][j])
+                rows[3 + i][3 + j] = rows[3 + j][3 + i] = shift_shift
+            rows[i][3 + j] = rows[3 + j][i] = total(r * crossed[j][i])
+    return cost, jnp.stack(pull), jnp.stack([jnp.stack(row) for row in rows])
 
 
 def _solved(hessian, right, damping):
