@@ -31,7 +31,7 @@ except ImportError:
 
 HERE = Path(__file__).parent
 COUNT, MARKS, FOCAL = 10_000, 20, 1000.0
-ROUNDS = 5
+ROUNDS = 15
 
 
 def pictures(points, poses, sigma_px: float, rng) -> Sighting:

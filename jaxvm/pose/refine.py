@@ -21,8 +21,8 @@ _MOST = 30
 _BLOCK = 256
 """Poses that are worked on together: their numbers stay in the cache of a processor."""
 
-_GAIN = 1e-7
-"""Gain in chi-square of a step that is the last."""
+_LEFT = 1e-12
+"""Chi-square that the step after the last one might still gain."""
 
 
 class Refined(eqx.Module):
@@ -153,6 +153,7 @@ class _State(eqx.Module):
     hessian: Float[Array, "6 6 b"]
     damping: Float[Array, " b"]
     change: Float[Array, "6 b"]
+    gain: Float[Array, " b"]
     done: Array
     iterations: Array
 
@@ -174,6 +175,7 @@ def _minimised(sighting: Sighting, rotation, shift) -> _State:
             rotation, shift, cost, pull, hessian,
             damping=jnp.full_like(cost, 1e-6),
             change=jnp.zeros_like(pull),
+            gain=jnp.ones_like(cost),
             done=~jnp.isfinite(cost),
             iterations=jnp.zeros_like(cost, dtype=int),
         )
@@ -199,23 +201,24 @@ def _step(marks: _Marks, s: _State) -> _State:
         hessian=jnp.where(go, hessian, s.hessian),
         damping=jnp.where(better, 0.1 * s.damping, jnp.maximum(10.0 * s.damping, 1e-3)),
         change=s.change,
+        gain=s.gain,
         done=s.done,
         iterations=s.iterations + ~s.done,
     )
 
 
 def _planned(s: _State) -> _State:
-    """The next step of all poses; one that gains next to nothing is the last, and is not checked.
+    """The next step of all poses; the last one is taken without a look at where it leads.
 
-    A step that gains g in chi-square moves a pose by at most sqrt(g) deviations, and Gauss and
-    Newton's error after it is smaller by orders.
+    Steps that gain g after g0 leave about g^2 / g0: Gauss and Newton's converge at a constant rate.
     """
     change = _solved(s.hessian, -s.pull, s.damping)
     gain = -jnp.sum(change * s.pull, axis=0)
-    last = ((gain <= _GAIN) | ~jnp.isfinite(gain)) & ~s.done
-    planned = eqx.tree_at(lambda s: s.change, s, change)
+    sound = jnp.isfinite(gain)
+    last = ((gain * gain <= _LEFT * s.gain) & (gain <= s.gain) | ~sound) & ~s.done
+    planned = eqx.tree_at(lambda s: (s.change, s.gain), s, (change, gain))
     rotation, shift = _moved(planned)
-    go = last & jnp.isfinite(gain)
+    go = last & sound
     return eqx.tree_at(
         lambda s: (s.rotation, s.shift, s.cost, s.done),
         planned,
