@@ -1,6 +1,9 @@
 """Identification and compensation: known systems, scipy's solutions, streams, files, bad input."""
 
+import importlib.util
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,18 +11,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter, lsim
 
+from jaxvm.cli import main
 from jaxvm.identify import Compensator, DriftModel, compensate, identify, read_drift_model
 from jaxvm.identify.difference import Orders, fit_difference
 from jaxvm.identify.identify import CONTINUOUS, DISCRETE, _choice
 from jaxvm.identify.inputs import POWER, Inputs, inputs_of
 from jaxvm.identify.lags import Structure, fit, regressors
+from jaxvm.identify.maps import drift_map, settled_after
 from jaxvm.identify.model import CameraDrift, Trained
 from jaxvm.identify.poses import image_poses
 from jaxvm.identify.trajectories import trajectories
 from jaxvm.network.residual import predict_pixels
 from jaxvm.network.scene import build
 from jaxvm.physics.effects import Effect, Scope, Term
-from jaxvm.recording import Drivers, Observations, Recording
+from jaxvm.recording import Drivers, Observations, Recording, read_recording
 from jaxvm.recording.model import Camera, Model, Station, Target
 from jaxvm.solve.adjust import adjust
 
@@ -316,6 +321,72 @@ def test_trajectories_are_the_changes_that_were_made():
     truth = 30e-6 * regressors(log.only(("ambient_degC",)), [20.0], Structure(1), [1500.0], 0.0)
     wrong = focal - (truth[:, 1] - truth[:, 1].mean())
     assert np.std(wrong) < 1.2 * spread[a.ports.index("sensor.focal")]
+
+
+def test_a_map_shows_what_every_mark_does_and_the_time_of_rest(identified):
+    recording = a_recording(DRIFT)
+    (own,) = identified.cameras
+    time = recording.time
+    place, move = drift_map(recording, "left", time < 600.0, time > 30000.0)
+    obs = recording.observations
+    for mark in (0, 13, 19):
+        own_marks = obs.point == mark
+        early, late = (obs.pixel[own_marks][chosen] for chosen in (time < 600.0, time > 30000.0))
+        np.testing.assert_allclose(place[mark], early.mean(axis=0), rtol=1e-12)
+        np.testing.assert_allclose(move[mark], late.mean(axis=0) - early.mean(axis=0), atol=1e-9)
+    with pytest.raises(ValueError, match="no mark is seen in both"):
+        drift_map(recording, "left", time < 0.0, time > 0.0)
+    # A lag of 25 min after a power-on at 15 min, of 1 px, noise 0.03 px.
+    warm = identify(a_recording(DRIFT[1:], hours=6.0), CONTINUOUS[2:3], one_step=False)
+    amplitude = 5000.0 * 2e-4 * (np.exp(600.0 / 1500.0) - 1.0)
+    expected = 900.0 + 1500.0 * np.log(amplitude / 0.03) - 600.0
+    assert settled_after(warm.cameras[0]) == pytest.approx(expected, abs=360.0)
+    assert settled_after(own) is None or settled_after(own) > 900.0
+
+
+def test_effects_that_share_their_constants_move_together():
+    """The time constant of a body is one unknown, whatever is driven by it."""
+    shared = replace(DRIFT[1], shares="focal")
+    scene = build(a_recording(DRIFT), (DRIFT[0], shared))
+    slots = scene.network.layout.all("constant")
+    assert scene.unknowns.column[slots[0]] == scene.unknowns.column[slots[1]]
+    apart = build(a_recording(DRIFT), DRIFT)
+    assert apart.unknowns.column[slots[0]] != apart.unknowns.column[slots[1]]
+    started = [replace(effect, constants=(1000.0,)) for effect in (DRIFT[0], shared)]
+    found = adjust(build(a_recording(DRIFT), tuple(started)))
+    tau = [effect.constants[0] for effect in found.scene.fitted_effects()]
+    assert tau[0] == tau[1] == pytest.approx(1500.0, abs=20.0)
+
+
+@pytest.fixture(scope="module")
+def drift_world():
+    file = Path(__file__).parent.parent / "benchmarks" / "drift" / "world.py"
+    spec = importlib.util.spec_from_file_location("drift_world", file)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["drift_world"] = module
+    spec.loader.exec_module(module)
+    yield module
+    del sys.modules["drift_world"]
+
+
+@pytest.mark.parametrize("family, seed, least", [("one node", 12, 0.95), ("two nodes", 11, 0.95),
+                                                 ("four nodes", 13, 0.85)])  # fmt: skip
+def test_a_thermal_network_that_is_no_model_of_ours(drift_world, tmp_path, family, seed, least):
+    """From the command line: train on one history, compensate another, against the truth."""
+    train, test = drift_world.pair(seed, family)
+    train.write(tmp_path / "monday")
+    test.write(tmp_path / "friday")
+    model, fixed = tmp_path / "drift.toml", tmp_path / "fixed"
+    assert main(["identify", str(tmp_path / "monday"), "--out", str(model), "--quiet"]) == 0
+    arguments = ["compensate", str(tmp_path / "friday"), "--model", str(model)]
+    assert main([*arguments, "--out", str(fixed), "--quiet"]) == 0
+    truth = drift_world.relative(train, test)
+    before, after = (read_recording(tmp_path / name).observations for name in ("friday", "fixed"))
+    left = truth + (after.pixel - before.pixel).reshape(truth.shape)
+    assert np.sqrt(np.mean(left**2)) < (1.0 - least) * np.sqrt(np.mean(truth**2))
+    assert (fixed / "poses.csv").is_file() and (fixed / "poses-before.csv").is_file()
+    # What is there is not written over.
+    assert main([*arguments, "--out", str(fixed), "--quiet"]) == 2
 
 
 # --- bad input -----------------------------------------------------------------------------------

@@ -1,12 +1,14 @@
 """Poses from images: against OpenCV and scipy, the one residual, and what theory predicts."""
 
+from dataclasses import replace
+
 import cv2
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from networks import board_recording
+from networks import board_recording, matrix, stereo_recording, to_plane, to_point
 from scipy.spatial.transform import Rotation
 
 from jaxvm.geometry import (
@@ -16,6 +18,9 @@ from jaxvm.geometry import (
     so3_left_jacobian_inverse,
     so3_log,
 )
+from jaxvm.network.scene import build
+from jaxvm.network.start import start
+from jaxvm.physics.effects import Effect, Scope, Term
 from jaxvm.pose.monocular import locate, orthogonal_iteration
 from jaxvm.pose.orientation import orient
 from jaxvm.pose.precision import Setup, precision
@@ -23,6 +28,8 @@ from jaxvm.pose.refine import refine, refine_many
 from jaxvm.pose.sighting import Sighting, sighting
 from jaxvm.pose.station import Ranges, locate_body, locate_from_station
 from jaxvm.pose.triangulate import linear, mid_point, optimal
+from jaxvm.recording.model import Prior, Rangefinder
+from jaxvm.recording.recording import Ranges as MeasuredRanges
 from jaxvm.solve.adjust import adjust
 from jaxvm.solve.covariance import standard_deviations
 
@@ -332,3 +339,37 @@ def test_ranges_are_those_of_the_chain():
     to_mark = eqx.tree_at(lambda r: r.to_plane, ranges, jnp.zeros(1))
     expected = np.linalg.norm(np.asarray(pose.apply(point[0])) - [0.1, 0, 0])
     assert float(to_mark.predicted(pose)[0]) == pytest.approx(expected, rel=1e-12)
+
+
+def test_mounting_and_index_error_of_a_rangefinder_are_estimated():
+    """A rangefinder whose place on the bar and whose zero nobody knows, from ranges alone."""
+    known = stereo_recording()
+    recording, model = known.recording, known.recording.model
+    plate, bar = model.targets[1].points, matrix(known.truth["world_from_station"][0])
+    true_place, index = model.rangefinders[0].pose, 3e-3
+    beam, rng = bar @ matrix(true_place), np.random.default_rng(5)
+    rows, distance = [], []
+    for epoch, pose in enumerate(known.truth["world_from_target"][1:]):
+        rows += [(epoch, point) for point in (-1, *range(len(plate)))]
+        distance += [to_plane(beam, matrix(pose))]
+        distance += [to_point(beam, matrix(pose), mark) for mark in plate]
+    epoch, point = np.array(rows).T
+    sigma = np.full(len(rows), 1e-4)
+    measured = np.array(distance) + index + sigma * rng.normal(size=len(rows))
+    ranges = MeasuredRanges(epoch, 0 * epoch, 0 * epoch + 1, point, measured, sigma)
+    finder = Rangefinder("lidar", "bar", true_place + [0.01, -0.01, 0.0, 0.02, -0.02, 0.01],
+                         frozenset({"pose"}))  # fmt: skip
+    # A turn about the beam itself shows in no range; it is known from the drawing.
+    held = Prior("rangefinders.lidar.pose", true_place, np.array([9.0, 9.0, 1e-4, 9.0, 9.0, 9.0]))
+    recording = replace(
+        recording, ranges=ranges, model=replace(model, rangefinders=(finder,), priors=(held,))
+    )
+    zero = Effect("index error", (Term("range.offset"),), scope=Scope(rangefinder=("lidar",)))
+    found = adjust(start(build(recording, (zero,))))
+    spread = standard_deviations(found, found.variance_factor)
+    place = np.asarray(found.scene.state.station_from_rangefinder[0] - true_place)[[0, 1, 3, 4, 5]]
+    deviation = np.asarray(spread.station_from_rangefinder[0])[[0, 1, 3, 4, 5]]
+    assert np.all(np.abs(place) < 4.0 * deviation) and np.all(deviation[2:4] < 2e-3)
+    z = (float(found.scene.state.amplitude[0]) - index) / float(spread.amplitude[0])
+    # Along the beam a shift looks much like an index error: each is known to 4 mm only.
+    assert abs(z) < 4.0 and float(spread.amplitude[0]) < 4e-3

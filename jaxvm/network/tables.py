@@ -232,12 +232,18 @@ class Tables:
         slots, expected, sigma = [], [], []
         for prior in self.model.priors:
             kind, name, quantity = prior.parameter.split(".")
-            bodies = {"cameras": self.model.cameras, "stations": self.model.stations}
+            bodies = {
+                "cameras": self.model.cameras,
+                "stations": self.model.stations,
+                "rangefinders": self.model.rangefinders,
+            }
             body = [b.name for b in bodies.get(kind, self.model.targets)].index(name)
             width = len(prior.value)
             if kind == "cameras":
                 table = "station_from_camera" if quantity == "pose" else quantity
                 rows = np.array([body])
+            elif kind == "rangefinders":
+                table, rows = "station_from_rangefinder", np.array([body])
             else:
                 of_body = self.station_row if kind == "stations" else self.target_row
                 table = "world_from_station" if kind == "stations" else "world_from_target"

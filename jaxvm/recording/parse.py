@@ -292,12 +292,13 @@ def _prior(entry: Entry, model: Model) -> Prior:
         "cameras": (model.cameras, (*_INTRINSICS, "pose")),
         "stations": (model.stations, ("pose",)),
         "targets": (model.targets, ("pose",)),
+        "rangefinders": (model.rangefinders, ("pose",)),
     }
     if len(parts) != 3 or parts[0] not in bodies or parts[2] not in bodies[parts[0]][1]:
         entry.fail(
             "parameter",
             f'a prior on "{parameter}" is not possible; use cameras.NAME.focal, centre, distortion '
-            "or pose, stations.NAME.pose or targets.NAME.pose",
+            "or pose, stations.NAME.pose, targets.NAME.pose or rangefinders.NAME.pose",
         )
     kind, name, quantity = parts
     named = {body.name: body for body in bodies[kind][0]}
