@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from networks import Known, at_values, stereo_recording
 
+from jaxvm.discover.courses import enumerate_courses
 from jaxvm.network.scene import build
-from jaxvm.physics.drivers import build_channels
+from jaxvm.physics.drivers import SESSION, build_channels
 from jaxvm.recording import (
     Drivers,
     RecordingError,
@@ -231,3 +232,26 @@ def test_shared_unknowns_cost_something(pair):
     increase = 2.0 * (together.cost - sum(a.cost for a in apart))
     assert 0.0 < increase < shared + 4.0 * np.sqrt(2.0 * shared)
     assert together.variance_factor == pytest.approx(1.0, abs=0.15)
+
+
+def test_courses_are_asked_on_the_scale_of_a_session(pair):
+    """Not of the pause between; and what is centred counts from the mean of the first recording."""
+    first, second = (equipped(known) for known in pair)
+    warmer = {name: values + 10.0 for name, values in second.drivers.channels.items()}
+    second = replace(second, drivers=replace(second.drivers, channels=warmer))
+    alone, both = (enumerate_courses(build(r)) for r in (first, join(first, second)))
+
+    def asked(courses, form: str):
+        return [(c.constants, c.reference) for c in courses
+                if (c.driver, c.form) == ("body_degC", form)]  # fmt: skip
+
+    for form in ("lag", "linear", "two lags"):
+        (taus, references), (expected, reference) = (
+            zip(*asked(courses, form), strict=True) for courses in (both, alone)
+        )
+        np.testing.assert_allclose(taus, expected, rtol=1e-9)
+        np.testing.assert_allclose(references, reference, rtol=1e-9)
+    periods = {c.constants[0] for c in both if c.driver == "time" and c.form == "periodic"}
+    assert max(periods) <= first.time[-1] - first.time[0] + 1e-9
+    ramps = [c.constants[0] for c in both if c.driver == SESSION and c.form == "ramp"]
+    assert ramps and max(ramps) <= first.time[-1] - first.time[0]
