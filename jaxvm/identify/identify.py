@@ -51,6 +51,7 @@ CONTINUOUS = (
     Structure(1),
     Structure(1, delayed=True),
     Structure(2),
+    Structure(0, power=0),
 )
 DISCRETE = (
     Orders("ARX", 1, 1),
@@ -133,7 +134,8 @@ class Identification:
                 f"camera {d.camera}: drift {d.drift_px:.3f} px RMS, foretold to "
                 f"{d.held_out_px:.3f} px in epochs that were not fitted"
             )
-            lines.append(f"  dynamics   {m.structure.name}, of {', '.join(m.inputs)}")
+            driven = f", of {', '.join(m.inputs)}" if m.gain.size else " that the inputs explain"
+            lines.append(f"  dynamics   {m.structure.name}{driven}")
             if isinstance(m, Lags) and len(m.tau):
                 taus = zip(m.tau, m.tau_sigma, strict=True)
                 told = ", ".join(f"{t / 60.0:.3g} ± {s / 60.0:.2g} min" for t, s in taus)

@@ -38,7 +38,7 @@ class Structure:
 
     Attributes:
         order: number of time constants; 0 is static.
-        power: largest power of the inputs that act at once (1 or 2).
+        power: largest power of the inputs that act at once: 0 (no drift), 1 or 2.
         delayed: whether inputs come late by a time of their own.
     """
 
@@ -48,14 +48,14 @@ class Structure:
 
     def regressor_ranges(self, ranges: Float[np.ndarray, " inputs"]) -> np.ndarray:
         """Ranges of all regressors in their order, from those of the inputs."""
-        squares = [ranges**2] if self.power == 2 else []
-        return np.concatenate([ranges, *squares, *[ranges] * self.order])
+        powers = [ranges**k for k in range(1, self.power + 1)]
+        return np.concatenate([np.zeros(0), *powers, *[ranges] * self.order])
 
     @property
     def name(self) -> str:
         """As it reads in a report."""
         if self.order == 0:
-            text = "static, linear" if self.power == 1 else "static, parabola"
+            text = ("no drift", "static, linear", "static, parabola")[self.power]
         else:
             text = f"{self.order} time constant{'s' if self.order > 1 else ''}"
         return f"{text}, delayed" if self.delayed else text
@@ -96,7 +96,7 @@ class Lags:
 
     def regressor_names(self) -> list[str]:
         """Names of the regressors in the order of the gains."""
-        names = list(self.inputs)
+        names = list(self.inputs) if self.structure.power else []
         if self.structure.power == 2:
             names += [f"{name} squared" for name in self.inputs]
         return names + [f"{name}, {tau:.4g} s late" for tau in self.tau for name in self.inputs]
@@ -104,8 +104,8 @@ class Lags:
     def stationary(self) -> Float[np.ndarray, "outputs inputs"]:
         """Change of every output for a lasting unit change of every input."""
         m, k = len(self.inputs), self.structure.power
-        lagged = self.gain[:, m * k :].reshape(len(self.gain), -1, m).sum(axis=1)
-        return self.gain[:, :m] + lagged
+        lagged = self.gain[:, m * k :].reshape(len(self.gain), self.structure.order, m).sum(axis=1)
+        return lagged + (self.gain[:, :m] if k else 0.0)
 
 
 def regressors(
@@ -152,7 +152,7 @@ def _regressors(data: _Data, tau, delay, power: int) -> Float[Array, "epochs reg
         return jnp.where(is_power, since, behind)
 
     now = jax.vmap(course)(data.x, data.power)
-    rows = [now] + ([now**2] if power == 2 else [])
+    rows = [jnp.zeros((0, len(data.time))), *(now**k for k in range(1, power + 1))]
     if tau.shape[0]:
         each = jax.vmap(lambda one: jax.vmap(lagged, (0, 0, None))(data.x, data.power, one))(tau)
         rows.append(each.reshape(-1, len(data.time)))

@@ -99,8 +99,8 @@ class _LagStream:
         self.time, self.now, self.lagged = time, now.astype(float), lagged
         since = -np.expm1(-np.maximum(x, 0.0) / m.tau[:, None])
         shown = np.where(self.power, since, lagged)
-        squares = [now.astype(float) ** 2] if m.structure.power == 2 else []
-        return np.concatenate([now.astype(float), *squares, shown.ravel()])
+        powers = [now.astype(float) ** k for k in range(1, m.structure.power + 1)]
+        return np.concatenate([np.zeros(0), *powers, shown.ravel()])
 
     def _late(self, time: float, x: np.ndarray) -> np.ndarray:
         """Readings of `delay` ago; what is older is forgotten."""
