@@ -333,7 +333,6 @@ def _compensate(options):
     from jaxvm.identify import compensate, read_drift_model
     from jaxvm.identify.poses import image_poses
     from jaxvm.recording import write_recording
-    from jaxvm.recording.files import write_files
     from jaxvm.solve.compiling import keep_compiled
 
     keep_compiled()
@@ -345,8 +344,7 @@ def _compensate(options):
         "poses-before.csv": image_poses(recording).to_csv(index=False),
         "poses.csv": image_poses(found.recording).to_csv(index=False),
     }
-    write_recording(found.recording, options.out)
-    write_files(options.out, poses)
+    write_recording(found.recording, options.out, beside=poses)
     answer = found.as_dict() | {"recording": str(options.out)}
     return answer, f"{found.summary()}\nwritten    {options.out}, with {', '.join(poses)}"
 

@@ -5,25 +5,35 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import equinox as eqx
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from networks import stereo_recording
 from scipy.signal import lfilter, lsim
 
 from jaxvm.cli import main
+from jaxvm.discover.cells import arrange
 from jaxvm.identify import Compensator, DriftModel, compensate, identify, read_drift_model
 from jaxvm.identify.difference import Orders, fit_difference
 from jaxvm.identify.identify import CONTINUOUS, DISCRETE, _choice
-from jaxvm.identify.inputs import POWER, Inputs, inputs_of
+from jaxvm.identify.inputs import Inputs, inputs_of
 from jaxvm.identify.lags import Structure, fit, regressors
 from jaxvm.identify.maps import drift_map, settled_after
 from jaxvm.identify.model import CameraDrift, Trained
 from jaxvm.identify.poses import image_poses
-from jaxvm.identify.trajectories import trajectories
-from jaxvm.network.residual import predict_pixels
+from jaxvm.identify.trajectories import (
+    CAMERA_PORTS,
+    _camera_of_cells,
+    _of_epochs,
+    trajectories,
+)
+from jaxvm.network.residual import predict_pixels, residual
 from jaxvm.network.scene import build
+from jaxvm.physics.drivers import POWER_ON
 from jaxvm.physics.effects import Effect, Scope, Term
+from jaxvm.physics.ports import PORT_INDEX
 from jaxvm.recording import Drivers, Observations, Recording, read_recording
 from jaxvm.recording.model import Camera, Model, Station, Target
 from jaxvm.solve.adjust import adjust
@@ -44,7 +54,7 @@ def made_inputs(seed: int = 0, on: float = 1800.0) -> Inputs:
     epochs = np.arange(0.0, 3600.0 * HOURS + 1.0, STEP)
     time = np.unique(np.concatenate([log, epochs]))
     values = np.stack([weather(time, seed), time - on])
-    return Inputs(("ambient_degC", POWER + "left"), time, values, np.searchsorted(time, epochs))
+    return Inputs(("ambient_degC", POWER_ON + "left"), time, values, np.searchsorted(time, epochs))
 
 
 def outputs(inputs: Inputs, taus=(600.0, 3000.0), seed: int = 0, noise: float = 1.0):
@@ -460,3 +470,62 @@ def test_a_foreign_camera_or_a_missing_input_is_told(identified):
         stream.correct(np.zeros((1, 2)))
     with pytest.raises(ValueError, match='has no "ambient_degC"'):
         stream.read(0.0, {})
+
+
+def test_cameras_that_share_a_moving_target_are_told_apart():
+    """Against one dense least-squares problem: ports of all cameras and the pose of each epoch."""
+    known = stereo_recording(with_ranges=False, right_lens="opencv4")
+    model = known.recording.model
+    fixed = tuple(replace(camera, free=frozenset()) for camera in model.cameras)
+    held = tuple(replace(station, free=frozenset()) for station in model.stations)
+    recording = replace(known.recording, model=replace(model, cameras=fixed, stations=held))
+    found = adjust(known.true_scene(recording))
+    names, sizes = list(CAMERA_PORTS), np.array(list(CAMERA_PORTS.values()))
+    (rows,) = found.scene.tables
+    obs = found.scene.recording.observations
+    chosen = obs.epoch[rows] == 2
+
+    def residuals(own) -> np.ndarray:
+        return np.asarray(residual(own.state, own.network).pixels[0])[: len(rows)][chosen].ravel()
+
+    columns = []
+    for camera in ("left", "right"):
+        for name, size in zip(names, sizes, strict=True):
+            both = []
+            for step in (1e-3 * size, -1e-3 * size):
+                effect = Effect(
+                    "", (Term(name),), scope=Scope(camera=(camera,)), amplitudes=(step,)
+                )
+                both.append(residuals(found.scene.with_effects((effect,))))
+            columns.append((both[0] - both[1]) / 2e-3)
+    state, row = found.scene.state, found.scene.target_row[1, 2]
+    for k in range(6):
+        both = []
+        for step in (1e-5, -1e-5):
+            poses = state.world_from_target.at[row, k].add(step)
+            moved = eqx.tree_at(lambda s: s.world_from_target, state, poses)
+            both.append(residuals(found.scene.with_state(moved)))
+        columns.append((both[0] - both[1]) / 2e-5)
+    a, p = np.array(columns).T, len(names)
+    normal, right = a.T @ a, -a.T @ residuals(found.scene)
+    rest = np.arange(p, 2 * p + 6)
+    free = normal[np.ix_(rest, rest)] + np.diag([1.0] * p + [0.0] * 6)  # a large drift of the other
+    away = np.linalg.solve(free, normal[rest, :p]).T
+    expected = normal[:p, :p] - away @ normal[rest, :p]
+    arranged = arrange(found)
+    tangent = arranged.cells.tangent[[PORT_INDEX[n] for n in names]] * sizes[:, None, None]
+    cameras = _camera_of_cells(found.scene, arranged.rows)
+    information, pull = _of_epochs(arranged.cells, tangent, cameras, 0)
+    scale = np.abs(expected).max()
+    np.testing.assert_allclose(information[2], expected, atol=1e-6 * scale)
+    wanted = right[:p] - away @ right[rest]
+    np.testing.assert_allclose(pull[2], wanted, atol=1e-5 * np.abs(wanted).max())
+
+
+def test_where_everything_is_known_there_is_still_drift():
+    recording = a_recording(DRIFT)
+    (plate,) = recording.model.targets
+    held = replace(recording.model, targets=(replace(plate, free=frozenset()),))
+    found = identify(replace(recording, model=held), CONTINUOUS[2:3])
+    tau = found.cameras[0].drift.dynamics
+    assert abs(tau.tau[0] - 1500.0) < 4.0 * tau.tau_sigma[0] < 100.0

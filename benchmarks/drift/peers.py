@@ -20,8 +20,9 @@ from nfoursid.state_space import StateSpace
 from world import FAMILIES, pair, relative
 
 from jaxvm.identify import compensate, identify
-from jaxvm.identify.inputs import POWER, inputs_of
+from jaxvm.identify.inputs import inputs_of
 from jaxvm.identify.model import CameraDrift
+from jaxvm.physics.drivers import POWER_ON
 from jaxvm.recording import read_recording
 from jaxvm.solve.compiling import keep_compiled
 
@@ -33,7 +34,7 @@ def drive(inputs, names, reference) -> np.ndarray:
     rows = []
     for name, zero in zip(names, reference, strict=True):
         x = inputs.row(name)[inputs.epoch]
-        rows.append((x >= 0.0).astype(float) if name.startswith(POWER) else x - zero)
+        rows.append((x >= 0.0).astype(float) if name.startswith(POWER_ON) else x - zero)
     return np.array(rows).T
 
 

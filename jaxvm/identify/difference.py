@@ -16,8 +16,8 @@ from jaxtyping import Float
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
-from jaxvm.identify.gains import SLOWEST, Fit, linear_gains, prior_widths
-from jaxvm.identify.inputs import POWER, Inputs
+from jaxvm.identify.gains import SLOWEST, Fit, foretold_density, linear_gains, prior_widths
+from jaxvm.identify.inputs import Inputs, are_power
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,11 +64,6 @@ class Difference:
         own = _Samples(inputs.only(self.inputs), self.reference, self.step)
         return (own.at_epochs(own.filtered(self.structure, self.a)) - self.centre) @ self.gain.T
 
-    def regressor_names(self) -> list[str]:
-        """Names of the regressors in the order of the gains."""
-        late = range(self.structure.nk, self.structure.nk + self.structure.nb)
-        return [f"{name}, {k} steps late" for name in self.inputs for k in late]
-
     def stationary(self) -> Float[np.ndarray, "outputs inputs"]:
         """Change of every output for a lasting unit change of every input."""
         each = self.gain.reshape(len(self.gain), len(self.inputs), -1).sum(axis=2)
@@ -84,11 +79,8 @@ class _Samples:
         count = before + int(np.ceil((epochs[-1] - epochs[0]) / step - 1e-6)) + 1
         self.time = epochs[0] + step * (np.arange(count) - before)
         self.epochs, self.before = epochs, before
-        rows = [np.interp(self.time, inputs.time, values) for values in inputs.values]
-        for k, name in enumerate(inputs.names):
-            on = name.startswith(POWER)
-            rows[k] = (rows[k] >= 0.0).astype(float) if on else rows[k] - reference[k]
-        self.u = np.array(rows)
+        x = np.array([np.interp(self.time, inputs.time, values) for values in inputs.values])
+        self.u = np.where(are_power(inputs.names)[:, None], x >= 0.0, x - reference[:, None])
 
     @property
     def slowest(self) -> float:
@@ -147,8 +139,7 @@ def fit_difference(
     epochs = inputs.time[inputs.epoch]
     if not is_even(epochs):
         raise ValueError("ARX and output error need epochs in equal steps; take time constants")
-    power = [name.startswith(POWER) for name in inputs.names]
-    reference = np.where(power, 0.0, inputs.values[:, inputs.epoch].mean(axis=1))
+    reference = inputs.reference
     step = float(np.median(np.diff(epochs)))
     samples = _Samples(inputs, reference, step)
     ranges = np.repeat(inputs.ranges(), structure.nb)
@@ -168,8 +159,7 @@ def fit_difference(
     for fold in np.unique(blocks):
         own = blocks == fold
         _, _, wrong, _, _, unsure = solved((~own).astype(float))
-        wider = 1.0 + unsure[own] / sigma[own] ** 2
-        held_out[own] = (wrong[own] / sigma[own]) ** 2 / wider + np.log(wider)
+        held_out[own] = foretold_density(wrong[own], unsure[own], sigma[own])
     r = found.shape[1]
     centre, gain = found.mean(axis=0), gains[1 : 1 + r].T
     spread = np.sqrt(variance[1 : 1 + r].T)

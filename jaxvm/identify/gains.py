@@ -41,6 +41,18 @@ class Fit:
     courses: Float[np.ndarray, "epochs outputs"]
 
 
+def foretold_density(error, variance, sigma) -> np.ndarray:
+    """Minus twice the logarithm of the foretold density of errors, over that of no error at all.
+
+    Args:
+        error: measured minus foretold.
+        variance: of what is foretold.
+        sigma: noise.
+    """
+    wider = 1.0 + variance / sigma**2
+    return (error / sigma) ** 2 / wider + np.log(wider)
+
+
 def prior_widths(
     large: Float[np.ndarray, " outputs"], ranges: Float[np.ndarray, " r"], states: int
 ) -> Float[np.ndarray, "1+r+states outputs"]:

@@ -16,14 +16,14 @@ import numpy as np
 from jaxvm.discover.select import DECIDED
 from jaxvm.identify.difference import Orders, fit_difference, is_even
 from jaxvm.identify.gains import SLOWEST, Fit
-from jaxvm.identify.inputs import POWER, RANGES, Inputs, inputs_of
+from jaxvm.identify.inputs import RANGES, Inputs, inputs_of
 from jaxvm.identify.lags import Lags, Structure, fit
 from jaxvm.identify.model import CameraDrift, DriftModel, Trained
 from jaxvm.identify.one_step import refined
 from jaxvm.identify.trajectories import Trajectories, depths, trajectories
 from jaxvm.network.scene import build
 from jaxvm.network.start import start
-from jaxvm.physics.drivers import channel_kind
+from jaxvm.physics.drivers import POWER_ON, channel_kind
 from jaxvm.recording import Recording
 from jaxvm.solve.adjust import Adjustment, adjust
 
@@ -195,7 +195,7 @@ def _check(recording: Recording, inputs: Inputs) -> None:
     seen = inputs.values[:, inputs.epoch]
     spans = {n: float(np.ptp(v)) for n, v in zip(inputs.names, seen, strict=True)}
     warm = {n: s for n, s in spans.items() if channel_kind(n) == "temperature"}
-    powered = any(n.startswith(POWER) and x.min() < 5.0 * 3600.0 for n, x in
+    powered = any(n.startswith(POWER_ON) and x.min() < 5.0 * 3600.0 for n, x in
                   zip(inputs.names, seen, strict=True))  # fmt: skip
     if warm and max(warm.values()) < _LEAST_K and not powered:
         name = max(warm, key=lambda n: warm[n])
@@ -210,13 +210,13 @@ def _own(inputs: Inputs, recording: Recording, camera: str, courses: Trajectorie
     others = {c.name for c in recording.model.cameras} - {camera}
     names = []
     for name in inputs.names:
-        body = name.removeprefix(POWER) if name.startswith(POWER) else ""
+        body = name.removeprefix(POWER_ON) if name.startswith(POWER_ON) else ""
         if name.startswith("body_"):
             body = name.removeprefix("body_").rsplit("_", 1)[0]
         x = inputs.row(name)[inputs.epoch]
         still = (
             np.all(x > 20.0 * 3600.0)
-            if name.startswith(POWER)
+            if name.startswith(POWER_ON)
             else (np.ptp(x) < _STILL * RANGES.get(channel_kind(name), 0.0) or np.ptp(x) == 0.0)
         )
         if body not in others and not still:
@@ -254,7 +254,7 @@ def _identified(plain, courses: Trajectories, inputs: Inputs, structures, progre
     noise = float(np.sum(courses.sigma**2)) / n
     excess = max(float(np.mean(best.held_out)) - courses.mode.shape[1], 0.0)
     moved = max(float(np.mean(np.sum(courses.mode**2, axis=1))) - noise, 0.0)
-    px = courses.pixel_sigma * np.sqrt(2.0 / courses.pixels)
+    px = courses.pixels_per_mode
     drift = CameraDrift(
         courses.camera, courses.ports, courses.held, dynamics, _depth(plain, courses.camera),
         trained, float(px * np.sqrt(excess)), float(px * np.sqrt(moved)),

@@ -1,15 +1,13 @@
 """Inputs of a drift model: what a recording logs, on one grid of times, and what is wrong."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from jaxvm.physics.drivers import channel_kind
+from jaxvm.physics.drivers import POWER_ON, channel_kind, since
 from jaxvm.recording import Recording
-
-POWER = "time since power-on of "
-"""Name of the input of a camera's own power, before the name of the camera (s)."""
 
 RANGES = {
     "temperature": 10.0,
@@ -25,7 +23,7 @@ RANGES = {
 """Change of a quantity, by its kind, that may move a camera by a large drift."""
 
 _STUCK = 10
-"""Readings in a row that are the same while another sensor moves: a sensor that hangs."""
+"""Readings in a row that are the same while a sensor of the same kind moves: one that hangs."""
 
 _GAP = 5.0
 """A pause in the log of so many usual intervals is a gap."""
@@ -36,7 +34,7 @@ class Inputs:
     """Courses that drive a camera.
 
     Attributes:
-        names: of the inputs; `POWER` and a camera for the time since its power-on (s).
+        names: of the inputs; `POWER_ON` and a camera for the time since its power-on (s).
         time: grid (s) of the log and the epochs together.
         values: one row an input, linear between the samples of the log.
         epoch: place of every epoch on the grid.
@@ -62,17 +60,27 @@ class Inputs:
             )
         return self.values[self.names.index(name)]
 
+    @property
+    def reference(self) -> Float[np.ndarray, " inputs"]:
+        """Mean of every input over the epochs, from which it is counted; 0 for power."""
+        return np.where(are_power(self.names), 0.0, self.values[:, self.epoch].mean(axis=1))
+
     def ranges(self) -> Float[np.ndarray, " inputs"]:
         """Change of every input that may bring a large drift, in its unit; 1 for power."""
         found = []
         for name, values in zip(self.names, self.values, strict=True):
             usual = RANGES.get(channel_kind(name), float(np.ptp(values[self.epoch])) or 1.0)
-            found.append(1.0 if name.startswith(POWER) else usual)
-        return np.array(found)
+            found.append(usual)
+        return np.where(are_power(self.names), 1.0, found)
 
     def only(self, names: tuple[str, ...]) -> "Inputs":
         """The inputs of these names, in their order."""
         return replace(self, names=names, values=np.stack([self.row(name) for name in names]))
+
+
+def are_power(names: Sequence[str]) -> Bool[np.ndarray, " inputs"]:
+    """Which inputs are the time since a power-on."""
+    return np.array([name.startswith(POWER_ON) for name in names], bool)
 
 
 def inputs_of(recording: Recording) -> Inputs:
@@ -90,7 +98,7 @@ def inputs_of(recording: Recording) -> Inputs:
     rows = {name: np.interp(time, own, values) for name, values in logged.items()}
     for camera in recording.model.cameras:
         if camera.powered_on_s:
-            rows[POWER + camera.name] = _since(time, np.asarray(camera.powered_on_s))
+            rows[POWER_ON + camera.name] = since(time, np.asarray(camera.powered_on_s))
     return Inputs(
         tuple(rows),
         time,
@@ -98,11 +106,6 @@ def inputs_of(recording: Recording) -> Inputs:
         np.searchsorted(time, epochs),
         tuple(_complaints(recording)),
     )
-
-
-def _since(time: np.ndarray, moments: np.ndarray) -> np.ndarray:
-    latest = np.maximum(np.searchsorted(moments, time, side="right") - 1, 0)
-    return time - moments[latest]
 
 
 def _complaints(recording: Recording) -> list[str]:
@@ -121,8 +124,8 @@ def _complaints(recording: Recording) -> list[str]:
             )
     for name, values in channels.items():
         k, length = _longest_run(values)
-        others = [v for other, v in channels.items() if other != name]
-        others = [v for v in others if channel_kind(name) == "temperature"]
+        others = [v for other, v in channels.items()
+                  if other != name and channel_kind(other) == channel_kind(name)]  # fmt: skip
         moved = any(np.ptp(v[k : k + length]) > 0.2 * np.ptp(v) > 0.0 for v in others)
         if length >= _STUCK and np.ptp(values) > 0.0 and length > 0.2 * len(values) and moved:
             found.append(

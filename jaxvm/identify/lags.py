@@ -20,8 +20,8 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from jaxvm.identify.gains import SLOWEST, Fit, gains_at, prior_widths
-from jaxvm.identify.inputs import POWER, Inputs
+from jaxvm.identify.gains import SLOWEST, Fit, foretold_density, gains_at, prior_widths
+from jaxvm.identify.inputs import Inputs, are_power
 from jaxvm.network.factors import rounded
 from jaxvm.physics.forms import first_order_lag
 
@@ -94,13 +94,6 @@ class Lags:
                            self.tau, self.delay)  # fmt: skip
         return (found - self.centre) @ self.gain.T
 
-    def regressor_names(self) -> list[str]:
-        """Names of the regressors in the order of the gains."""
-        names = list(self.inputs) if self.structure.power else []
-        if self.structure.power == 2:
-            names += [f"{name} squared" for name in self.inputs]
-        return names + [f"{name}, {tau:.4g} s late" for tau in self.tau for name in self.inputs]
-
     def stationary(self) -> Float[np.ndarray, "outputs inputs"]:
         """Change of every output for a lasting unit change of every input."""
         m, k = len(self.inputs), self.structure.power
@@ -127,7 +120,7 @@ class _Data(eqx.Module):
 def _padded(inputs: Inputs, reference: np.ndarray) -> _Data:
     """Inputs with spare samples, so that a log of another length is no other program."""
     time, x = inputs.time, inputs.values
-    power = np.array([name.startswith(POWER) for name in inputs.names])
+    power = are_power(inputs.names)
     x = np.where(power[:, None], x, x - reference[:, None])
     spare = rounded(len(time)) - len(time)
     step = time[-1] - time[-2] if len(time) > 1 else 1.0
@@ -178,9 +171,7 @@ def fit(
         blocks: number of the block of each epoch.
         large: what a large drift is; gains have priors of this size.
     """
-    power = [name.startswith(POWER) for name in inputs.names]
-    seen = inputs.values[:, inputs.epoch]
-    reference = np.where(power, 0.0, seen.mean(axis=1))
+    reference = inputs.reference
     data = _padded(inputs, reference)
     n, spare = len(output), len(data.epoch) - len(output)
     pad = ((0, spare), (0, 0))
@@ -208,8 +199,7 @@ def fit(
     for fold, other in zip(folds, found[1:], strict=True):
         own = blocks == fold
         wrong, unsure = (np.asarray(part)[:n][own] for part in (other[0], other[3]))
-        wider = 1.0 + unsure / sigma[own] ** 2
-        held_out[own] = (wrong / sigma[own]) ** 2 / wider + np.log(wider)
+        held_out[own] = foretold_density(wrong, unsure, sigma[own])
     tau, delay = _constants(jnp.asarray(packed[0]), structure.order, bounds, step)
     tau, delay = np.asarray(tau), float(delay) if structure.delayed else 0.0
     found = regressors(inputs, reference, structure, tau, delay)

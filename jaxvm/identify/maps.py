@@ -51,8 +51,8 @@ def settled_after(found: Identified, window: float = 600.0) -> float | None:
     courses, time = found.fit.courses, found.trajectories.time
     later = np.array([np.interp(time + window, time, column) for column in courses.T]).T
     inside = time + window <= time[-1]
-    step = np.sqrt(2.0 * np.sum((later - courses) ** 2, axis=1) / found.trajectories.pixels)
-    moving = np.flatnonzero((step >= 1.0) & inside)
+    step = found.trajectories.pixels_per_mode * np.linalg.norm(later - courses, axis=1)
+    moving = np.flatnonzero((step >= found.trajectories.pixel_sigma) & inside)
     if not len(moving):
         return float(time[0])
     after = min(moving[-1] + 1, len(time) - 1)

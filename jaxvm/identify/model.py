@@ -10,8 +10,9 @@ import tomli_w
 from jaxtyping import Bool
 
 from jaxvm.identify.difference import Difference, Orders
-from jaxvm.identify.inputs import POWER, Inputs
+from jaxvm.identify.inputs import Inputs
 from jaxvm.identify.lags import Lags, Structure
+from jaxvm.physics.drivers import POWER_ON
 from jaxvm.physics.ports import PORT_INDEX
 
 FORMAT = 1
@@ -61,7 +62,7 @@ class CameraDrift:
         """Epochs at which an input is outside the range that the model was trained on."""
         found = np.zeros(len(inputs.epoch), bool)
         for name, known in self.trained.items():
-            if not name.startswith(POWER):
+            if not name.startswith(POWER_ON):
                 margin = _BEYOND * (known.high - known.low)
                 x = inputs.row(name)[inputs.epoch]
                 found |= (x < known.low - margin) | (x > known.high + margin)

@@ -12,11 +12,12 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxvm.identify.gains import LOOSE
-from jaxvm.identify.inputs import POWER, Inputs
+from jaxvm.identify.inputs import Inputs
 from jaxvm.identify.lags import Lags, regressors
 from jaxvm.identify.model import CameraDrift
 from jaxvm.identify.trajectories import CAMERA_PORTS
 from jaxvm.network.scene import build
+from jaxvm.physics.drivers import POWER_ON
 from jaxvm.physics.effects import Effect, Scope, Term
 from jaxvm.recording import Drivers, Recording
 from jaxvm.solve.adjust import Adjustment, adjust
@@ -55,7 +56,7 @@ def refined(plain: Adjustment, drifts: list[CameraDrift], inputs: Inputs) -> lis
 
 
 def _late(name: str, delay: float) -> str:
-    return name if delay == 0.0 or name.startswith(POWER) else f"{name} {delay:.1f} s late"
+    return name if delay == 0.0 or name.startswith(POWER_ON) else f"{name} {delay:.1f} s late"
 
 
 def _with_late_channels(recording: Recording, model: Lags) -> Recording:
@@ -91,7 +92,7 @@ def _effects(drift: CameraDrift, ranges: Float[np.ndarray, " inputs"]) -> list[E
 
     inputs = list(zip(model.inputs, model.reference, LOOSE / ranges, strict=True))
     for name, reference, spread in inputs:
-        if name.startswith(POWER):
+        if name.startswith(POWER_ON):
             add(name, name, "step", (0.0,), values=next(gain), spread=spread)
         else:
             driver = _late(name, model.delay)
@@ -100,7 +101,7 @@ def _effects(drift: CameraDrift, ranges: Float[np.ndarray, " inputs"]) -> list[E
         first, begun = "", False
         for name, reference, spread in inputs:
             own, constants = f"{name}, lag {k + 1}", (float(tau),)
-            if name.startswith(POWER):
+            if name.startswith(POWER_ON):
                 add(own, name, "onset", constants, 0.0, first, next(gain), spread)
             else:
                 form = "lag" if begun else "lag with state"

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from jaxvm.identify.compensate import moved
 from jaxvm.identify.difference import Difference
-from jaxvm.identify.inputs import POWER, Inputs
+from jaxvm.identify.inputs import Inputs, are_power
 from jaxvm.identify.lags import Lags
 from jaxvm.identify.model import CameraDrift
 from jaxvm.recording.model import Camera
@@ -71,7 +71,7 @@ class _LagStream:
 
     def __init__(self, model: Lags):
         self.model = model
-        self.power = np.array([name.startswith(POWER) for name in model.inputs])
+        self.power = are_power(model.inputs)
         self.time = 0.0
         self.lagged: np.ndarray | None = None  # [order, inputs]
         self.now: np.ndarray | None = None
@@ -119,7 +119,7 @@ class _StepStream:
 
     def __init__(self, model: Difference):
         self.model = model
-        self.power = np.array([name.startswith(POWER) for name in model.inputs])
+        self.power = are_power(model.inputs)
         self.start: float | None = None
         self.count = 0
         orders = model.structure

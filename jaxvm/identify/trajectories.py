@@ -1,10 +1,10 @@
 """Trajectories: the state of the cameras epoch by epoch, in numbers that the images can show.
 
-The plain model is adjusted; what it leaves in every epoch is explained by the ports of the cameras
-(turns, principal distance, ...), free poses of that epoch eliminated. Many changes look alike
-(MATHEMATICS 1.2): a port that does not show beside those before it is held at zero. That choice of
-gauge is stated; it changes no predicted image of the same geometry. The others are turned into
-*modes*, combinations of ports whose noise is 1 and independent.
+The plain model is adjusted; what it leaves in every epoch is explained by the ports of all cameras
+together (turns, principal distance, ...), free poses of that epoch eliminated. Many changes look
+alike (MATHEMATICS 1.2): a port that does not show beside those before it is held at zero. That
+choice of gauge is stated; it changes no predicted image of the same geometry. The others are turned
+into *modes*, combinations of ports whose noise is 1 and independent.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxvm.discover.cells import arrange
+from jaxvm.discover.cells import Cells, arrange
 from jaxvm.geometry import pose_from_vector
 from jaxvm.network.scene import Scene
 from jaxvm.physics.ports import PORT_INDEX
@@ -80,10 +80,10 @@ class Trajectories:
         """Changes of the ports in this gauge, in their units."""
         return self.mode @ self.ports_from_mode.T
 
-    def rms_px(self, mode: Float[np.ndarray, "epochs modes"]) -> float:
-        """RMS displacement of a mark (px) that amplitudes of modes stand for."""
-        return float(np.sqrt(2.0 * np.mean(np.sum(mode**2, axis=1)) / self.pixels)
-                     * self.pixel_sigma)  # fmt: skip
+    @property
+    def pixels_per_mode(self) -> float:
+        """RMS displacement (px) of the marks by a unit of any mode."""
+        return float(self.pixel_sigma * np.sqrt(2.0 / self.pixels))
 
     def gauge(self) -> str:
         """In words, what was estimated and what was held."""
@@ -103,29 +103,14 @@ def trajectories(adjustment: Adjustment, camera: str, least: float = 3.0) -> Tra
         ValueError: the camera sees nothing, or its changes do not show in any image.
     """
     scene = adjustment.scene
-    places = [c.name for c in scene.model.cameras]
-    number = places.index(camera)
-    cells = (found := arrange(adjustment)).cells
-    of_camera = _camera_of_cells(scene, found.rows) == number
-    if not of_camera.any():
+    number = [c.name for c in scene.model.cameras].index(camera)
+    arranged = arrange(adjustment)
+    of_camera = _camera_of_cells(scene, arranged.rows)
+    if not np.any(of_camera == number):
         raise ValueError(f'camera "{camera}" sees nothing; there is no drift to identify')
     ports, size = tuple(CAMERA_PORTS), np.array(list(CAMERA_PORTS.values()))
-    tangent = cells.tangent[[PORT_INDEX[p] for p in ports]] * size[:, None, None]
-    n_epochs, p = cells.n_epochs, len(ports)
-    information, right = np.zeros((n_epochs, p, p)), np.zeros((n_epochs, p))
-    half = cells.half[:, :, : cells.n_local]
-    for epoch in range(n_epochs):
-        own = np.flatnonzero((cells.epoch_of == epoch) & of_camera)
-        if not len(own):
-            continue
-        g = tangent[:, own].reshape(p, -1)
-        e = cells.residual[own].reshape(-1)
-        # What a pose of this epoch alone would explain is no change of the camera.
-        group = cells.group_of[own[0]]
-        free = half[own].reshape(len(e), -1) if group < len(cells.group) else np.zeros((len(e), 0))
-        g = g - (g @ free) @ free.T
-        information[epoch] = g @ g.T
-        right[epoch] = -g @ (e - free @ (free.T @ e))
+    tangent = arranged.cells.tangent[[PORT_INDEX[p] for p in ports]] * size[:, None, None]
+    information, right = _of_epochs(arranged.cells, tangent, of_camera, number)
     seen = np.einsum("epp->e", information) > 0.0
     mean = information[seen].mean(axis=0)
     apart = _at_several_ranges(scene, number)
@@ -159,6 +144,39 @@ def trajectories(adjustment: Adjustment, camera: str, least: float = 3.0) -> Tra
         pixels=2.0 * np.sum(obs.camera == number) / seen.sum(),
         pixel_sigma=float(np.median(obs.sigma)),
     )
+
+
+def _of_epochs(
+    cells: Cells, tangent: Float[np.ndarray, "p cells rows"], camera: np.ndarray, number: int
+) -> tuple[Float[np.ndarray, "epochs p p"], Float[np.ndarray, "epochs p"]]:
+    """Information about the ports of a camera in every epoch, and the right side with it.
+
+    All cameras of an epoch may have changed, and the poses of that epoch are free: with F the rows
+    of J L^-T of these, the ports g of all cameras have the information g g^T - (g F) (g F)^T. The
+    other cameras, with priors of a large drift, are eliminated. At the solution what is left is
+    square to the free poses already.
+    """
+    p, n_cameras, d = len(tangent), camera.max() + 1, cells.n_local
+    information, right = np.zeros((cells.n_epochs, p, p)), np.zeros((cells.n_epochs, p))
+    mine = np.arange(number * p, (number + 1) * p)
+    others = np.setdiff1d(np.arange(n_cameras * p), mine)
+    for epoch in np.unique(cells.epoch_of[camera == number]):
+        own = np.flatnonzero((cells.epoch_of == epoch) & (camera >= 0))
+        joint, pull = np.zeros((n_cameras * p, n_cameras * p)), np.zeros(n_cameras * p)
+        free: dict[int, np.ndarray] = {}
+        for k in own:
+            g, at = tangent[:, k], slice(camera[k] * p, (camera[k] + 1) * p)
+            joint[at, at] += g @ g.T
+            pull[at] -= g @ cells.residual[k]
+            if d and cells.group_of[k] < len(cells.group):
+                taken = free.setdefault(int(cells.group_of[k]), np.zeros((n_cameras * p, d)))
+                taken[at] += g @ cells.half[k, :, :d]
+        joint -= sum((taken @ taken.T for taken in free.values()), np.zeros_like(joint))
+        cross = joint[np.ix_(mine, others)]
+        away = np.linalg.solve(joint[np.ix_(others, others)] + np.eye(len(others)), cross.T).T
+        information[epoch] = joint[np.ix_(mine, mine)] - away @ cross.T
+        right[epoch] = pull[mine] - away @ pull[others]
+    return information, right
 
 
 def _at_several_ranges(scene: Scene, camera: int) -> bool:

@@ -69,6 +69,9 @@ PLANE_BASES = ("tile", "sine", "cosine")
 OWN_BODY, OWN_POWER_ON = "own_body_degC", "time since own power-on"
 """Drivers that each camera has for itself."""
 
+POWER_ON = "time since power-on of "
+"""Name of the driver of a camera's power-on, before the name of the camera."""
+
 SESSION = "time since the session's start"
 """Driver of recordings with several sessions."""
 
@@ -278,16 +281,13 @@ def build_channels(
         name = "time" if timed else "order"
         rows[name] = (name, grid - epoch_time[0])
     if timed and len(sessions) > 1:
-        rows[SESSION] = ("time", _since(grid, sessions))
-    rows |= {
-        f"time since power-on of {camera}": ("power-on", _since(grid, own))
-        for camera, own in moments.items()
-    }
+        rows[SESSION] = ("time", since(grid, sessions))
+    rows |= {POWER_ON + camera: ("power-on", since(grid, own)) for camera, own in moments.items()}
     names = list(rows)
     reads = {name: (place,) * max(len(cameras), 1) for place, name in enumerate(names)}
     for name, kind, of_camera in (
         (OWN_BODY, "own", "body_{}_degC"),
-        (OWN_POWER_ON, "power-on", "time since power-on of {}"),
+        (OWN_POWER_ON, "power-on", POWER_ON + "{}"),
     ):
         each = [of_camera.format(camera) for camera in cameras]
         if len(each) > 1 and all(own in rows for own in each):
@@ -313,7 +313,7 @@ def _differences(recorded: dict[str, Float[np.ndarray, " times"]]) -> dict[str, 
     return {f"{name} - {air}": recorded[name] - recorded[air] for name in bodies}
 
 
-def _since(time: np.ndarray, moments: np.ndarray) -> np.ndarray:
+def since(time: np.ndarray, moments: np.ndarray) -> np.ndarray:
     """Time since the latest of the moments (s); negative before the first."""
     latest = np.maximum(np.searchsorted(moments, time, side="right") - 1, 0)
     return time - moments[latest]

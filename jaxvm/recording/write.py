@@ -1,5 +1,6 @@
 """Write a recording as a folder: the inverse of `read_recording`."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -16,9 +17,16 @@ RATES = ("vx", "vy", "vz", "wx", "wy", "wz")
 
 
 def write_recording(
-    recording: Recording, folder: str | Path, table: Literal["csv", "parquet"] = "csv"
+    recording: Recording,
+    folder: str | Path,
+    table: Literal["csv", "parquet"] = "csv",
+    beside: Mapping[str, str] | None = None,
 ) -> Path:
     """Write a recording into a new folder, which appears when it is complete.
+
+    Args:
+        table: form of the tables.
+        beside: further texts by their file names, which are no part of the recording.
 
     Raises:
         FileExistsError: the folder is already there and not empty.
@@ -31,6 +39,8 @@ def write_recording(
                 frame.to_parquet(staging / f"{name}.parquet", index=False)
             else:
                 frame.to_csv(staging / f"{name}.csv", index=False, lineterminator="\n")
+        for name, text in (beside or {}).items():
+            (staging / name).write_text(text, encoding="utf-8")
     return Path(folder)
 
 

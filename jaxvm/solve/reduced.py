@@ -34,9 +34,7 @@ def half_rows(
     packet_of = packet_of_rows(packets, jacobian.shape[0])
     shared = _spread(jacobian, place[packet_of], s)
     if not groups:
-        return jax.scipy.linalg.solve_triangular(
-            factors.reduced, shared.reshape(-1, s).T, lower=True
-        ).T.reshape(shared.shape)
+        return _through(factors.reduced, shared)
     local = _spread(jacobian, member[packet_of], d)
     own = jnp.minimum(group[packet_of], groups - 1)
     local = jnp.where((group[packet_of] < groups)[:, None, None], local, 0.0)
@@ -44,8 +42,15 @@ def half_rows(
         factors.local[own], local
     )
     rest = shared - jnp.einsum("nad,nds->nas", solved, factors.coupled[own])
-    reduced = jax.scipy.linalg.solve_triangular(factors.reduced, rest.reshape(-1, s).T, lower=True)
-    return jnp.concatenate([solved, reduced.T.reshape(rest.shape)], axis=2)
+    return jnp.concatenate([solved, _through(factors.reduced, rest)], axis=2)
+
+
+def _through(root, rows):
+    """Rows times the inverse transposed of a lower triangle; untouched where nothing is shared."""
+    if not rows.shape[2]:
+        return rows
+    flat = rows.reshape(-1, rows.shape[2])
+    return jax.scipy.linalg.solve_triangular(root, flat.T, lower=True).T.reshape(rows.shape)
 
 
 def _spread(jacobian, places, width):
