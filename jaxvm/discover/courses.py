@@ -48,14 +48,21 @@ def driver_kind(scene: Scene, driver: str) -> str:
     return "time" if kind == "order" else kind
 
 
-def kinds_in_scope(kind: str, driver: str, scope: Scope) -> tuple[str, ...]:
-    """Kinds of a driver for the bodies of a scope, general ones first."""
+def kinds_in_scope(
+    kind: str, driver: str, scope: Scope, channels: tuple[str, ...]
+) -> tuple[str, ...]:
+    """Kinds of a driver for the bodies of a scope, general ones first.
+
+    The body of another camera is a neighbour. Where the camera's own body is logged, too, it is
+    nothing else: physics of a camera follows its own temperature, not one like it.
+    """
     if kind not in ("quantity", "difference", "own"):
         return tuple(kind.split(" or "))
     own = channel_kind(driver)
     body = driver.split(" - ")[0].removeprefix("body_").removesuffix("_degC")
     if driver.startswith("body_") and len(scope.camera) == 1 and body not in scope.camera:
-        return ("quantity", own, "neighbour")
+        logged = f"body_{scope.camera[0]}_degC" in channels
+        return ("neighbour",) if logged else ("quantity", own, "neighbour")
     return ("quantity", own)
 
 
