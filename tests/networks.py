@@ -25,7 +25,7 @@ from jaxvm.recording.model import (
     Target,
     grid_names,
 )
-from jaxvm.recording.recording import Links, Observations, Ranges, Recording
+from jaxvm.recording.recording import Links, Observations, Ranges, Recording, uncorrelated
 from jaxvm.solve.adjust import Adjustment, adjust
 
 IMAGE = (1280, 960)
@@ -207,7 +207,7 @@ def board_recording(
         priors=(Prior("cameras.cam.centre", camera.centre_px, np.full(2, 1e9)),),
     )
     seen = photographs(model, n_epochs, [[HELD] * n_epochs], [poses], [marks], rng, noise)
-    truth = _of_cameras(model.cameras) | {"world_from_target": poses}
+    truth = _of_cameras(model.cameras) | {"carrier_from_target": poses}
     return Known(_recording(model, seen, n_epochs), truth)
 
 
@@ -262,7 +262,7 @@ def stereo_recording(
     seen = photographs(model, n_epochs, [[bar] * n_epochs], targets, [reference, plate], rng, noise)
     truth = _of_cameras(model.cameras) | {
         "world_from_station": bar[None],
-        "world_from_target": np.concatenate([HELD[None], moving]),
+        "carrier_from_target": np.concatenate([HELD[None], moving]),
     }
     ranges = None
     if with_ranges:
@@ -338,7 +338,7 @@ def free_points_recording(seed: int = 0, noise: float = 1.0, n_epochs: int = 2) 
     seen = photographs(model, n_epochs, standing, [held, held], [corners, cloud], rng, noise)
     truth = _of_cameras(cameras) | {
         "world_from_station": np.array(stations),
-        "world_from_target": np.zeros((2, 6)),
+        "carrier_from_target": np.zeros((2, 6)),
         "point": np.concatenate([corners, cloud]),
     }
     return Known(_recording(model, seen, n_epochs), truth)
@@ -407,8 +407,7 @@ def relay_recording(seed: int = 0, noise: float = 1.0) -> Known:
         [a for a, _ in ends.values()],
         [b for _, b in ends.values()],
         np.array(measured),
-        sigma_rad,
-        sigma_m,
+        uncorrelated(sigma_rad, sigma_m),
         np.full(5, -1),
     )
     model = Model(
@@ -425,7 +424,7 @@ def relay_recording(seed: int = 0, noise: float = 1.0) -> Known:
     seen = photographs_of_pairs(model, stations, targets, marks, rng, noise)
     truth = _of_cameras(cameras) | {
         "world_from_station": stations,
-        "world_from_target": targets,
+        "carrier_from_target": targets,
         "link": np.array([vector(pose) for pose in true[2:]]),
     }
     return Known(_recording(model, seen, 2, links=links), truth)

@@ -22,6 +22,7 @@ from jaxvm.network.residual import residual
 from jaxvm.network.scene import build
 from jaxvm.physics.effects import Effect, Term
 from jaxvm.recording.model import Closure, Prior
+from jaxvm.recording.recording import uncorrelated
 from jaxvm.solve.adjust import adjust
 from jaxvm.solve.arrow import factorise
 from jaxvm.solve.covariance import standard_deviations
@@ -238,8 +239,7 @@ def test_a_link_in_a_loop_still_joins_its_bodies():
         from_node=[("station", a) for a, _ in ends],
         to_node=[("station", b) for _, b in ends],
         pose=np.array(poses),
-        sigma_rad=np.full(3, 1e-4),
-        sigma_m=np.full(3, 1e-3),
+        covariance=uncorrelated(np.full(3, 1e-4), np.full(3, 1e-3)),
         epoch=np.full(3, -1),
     )
     closure = Closure((("ab", 1), ("bc", 1), ("ac", -1)), 1e-5, 1e-5)
@@ -247,9 +247,10 @@ def test_a_link_in_a_loop_still_joins_its_bodies():
     scene = build(recording)
     # Station s1 and its target move together: no camera can see it, the links must.
     step = matrix([0.0, 0.0, 0.0, 0.1, 0.0, 0.0])
-    place, target = (np.array(known.truth[f"world_from_{k}"]) for k in ("station", "target"))
+    fields = ("world_from_station", "carrier_from_target")
+    place, target = (np.array(known.truth[field]) for field in fields)
     place[1], target[1] = (vector(step @ matrix(p[1])) for p in (place, target))
-    moved = at_values(scene, {"world_from_station": place, "world_from_target": target})
+    moved = at_values(scene, {"world_from_station": place, "carrier_from_target": target})
 
     def cost(scene):
         blocks = eqx.filter_jit(residual)(scene.state, scene.network)

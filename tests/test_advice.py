@@ -134,8 +134,8 @@ def test_the_predicted_gap_is_the_difference_of_refits(stereo):
         name: np.asarray(getattr(stereo.state, name))
         for name in ("focal", "centre", "distortion", "station_from_camera", "world_from_station")
     }
-    targets = [np.asarray(s.state.world_from_target) for s in (stereo, further.scene)]
-    state["world_from_target"] = np.concatenate([targets[0], targets[1][1:]])
+    targets = [np.asarray(s.state.carrier_from_target) for s in (stereo, further.scene)]
+    state["carrier_from_target"] = np.concatenate([targets[0], targets[1][1:]])
     plain = at_values(build(both), state)
     found = {}
     for name, hypothesis in (("true", FOCAL), ("rival", SHIFT)):
@@ -240,7 +240,7 @@ def test_a_pair_that_distance_does_not_part(frontal):
 
 
 def plate_poses(scene: Scene) -> np.ndarray:
-    return np.asarray(scene.state.world_from_target)[scene.target_row[-1]]
+    return np.asarray(scene.state.carrier_from_target)[scene.target_row[-1]]
 
 
 def middles_of(scene: Scene) -> np.ndarray:

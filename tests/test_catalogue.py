@@ -273,7 +273,7 @@ def test_drivers_of_a_distance_by_hand():
     assert np.all(table[:, at["one"]] == 1.0)
 
     beam = matrix(model.stations[0].pose) @ matrix(model.rangefinders[0].pose)
-    poses = np.asarray(known.truth["world_from_target"])
+    poses = np.asarray(known.truth["carrier_from_target"])
     for row, (epoch, target, point) in enumerate(
         zip(ranges.epoch, ranges.target, ranges.point, strict=True)
     ):

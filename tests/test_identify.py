@@ -502,8 +502,8 @@ def test_cameras_that_share_a_moving_target_are_told_apart():
     for k in range(6):
         both = []
         for step in (1e-5, -1e-5):
-            poses = state.world_from_target.at[row, k].add(step)
-            moved = eqx.tree_at(lambda s: s.world_from_target, state, poses)
+            poses = state.carrier_from_target.at[row, k].add(step)
+            moved = eqx.tree_at(lambda s: s.carrier_from_target, state, poses)
             both.append(residuals(found.scene.with_state(moved)))
         columns.append((both[0] - both[1]) / 2e-5)
     a, p = np.array(columns).T, len(names)

@@ -222,9 +222,9 @@ def test_shared_unknowns_cost_something(pair):
     apart = [adjust(known.true_scene()) for known in pair]
     both = join(pair[0].recording, pair[1].recording)
     truth = pair[0].truth
-    reference, moving = truth["world_from_target"][:1], truth["world_from_target"][1:]
-    targets = np.concatenate([reference, moving, pair[1].truth["world_from_target"][1:]])
-    scene = at_values(build(both), truth | {"world_from_target": targets})
+    reference, moving = truth["carrier_from_target"][:1], truth["carrier_from_target"][1:]
+    targets = np.concatenate([reference, moving, pair[1].truth["carrier_from_target"][1:]])
+    scene = at_values(build(both), truth | {"carrier_from_target": targets})
     together = adjust(scene)
     assert together.converged, together.why
     shared = scene.unknowns.n_shared

@@ -29,7 +29,8 @@ COEFFICIENTS = {
 POSES = {  # nothing is parallel to anything
     "station_from_camera": [0.1, -0.2, 0.15, 0.2, -0.1, 0.3],
     "world_from_station": [-0.2, 0.3, -0.4, 1.0, 2.0, -0.5],
-    "world_from_target": [0.25, 0.45, 0.3, 3.6, 1.6, 5.5],
+    "world_from_carrier": [-0.1, 0.2, 0.05, 0.4, -0.3, 0.2],
+    "carrier_from_target": [0.36, 0.23, 0.27, 3.4, 1.8, 5.1],
 }
 GENERAL = Circumstances(
     pixel=np.array([1500.0, 300.0]),
@@ -64,7 +65,8 @@ def ranges():
     aim = Aim(
         station_from_rangefinder=POSES["station_from_camera"],
         world_from_station=POSES["world_from_station"],
-        world_from_target=POSES["world_from_target"],
+        world_from_carrier=POSES["world_from_carrier"],
+        carrier_from_target=POSES["carrier_from_target"],
         point=POINT,
     )
     aim = Aim(*(jnp.asarray(value, float) for value in aim))
@@ -593,7 +595,8 @@ def _bench_arrays(bench):
         distortion=np.zeros(0),
         station_from_camera=bench.camera,
         world_from_station=bench.station,
-        world_from_target=(*bench.target_turn, *bench.origin),
+        world_from_carrier=np.zeros(6),
+        carrier_from_target=(*bench.target_turn, *bench.origin),
         point=bench.point,
     )
     at = Circumstances(
@@ -612,9 +615,7 @@ def bench_pixel(sight, at, values):
 
 @jax.jit
 def bench_range(sight, at, values, to_plane):
-    aim = Aim(
-        sight.station_from_camera, sight.world_from_station, sight.world_from_target, sight.point
-    )
+    aim = Aim(*sight[3:])
     return predict_range(aim, at, to_plane, PortValues(values))
 
 

@@ -203,9 +203,9 @@ def test_the_pose_is_that_of_the_one_residual():
             jnp.asarray(obs.sigma[rows]),
         )
         found = one(seen).best
-        expected = np.asarray(result.scene.state.world_from_target)[k]
+        expected = np.asarray(result.scene.state.carrier_from_target)[k]
         own = np.asarray(found.observer_from_target)
-        sigma = np.asarray(spread.world_from_target)[k]
+        sigma = np.asarray(spread.carrier_from_target)[k]
         # Whitening is first order in the noise.
         np.testing.assert_allclose(own, expected, atol=0.02 * sigma.max())
         to_vector = so3_left_jacobian_inverse(found.observer_from_target[:3])
@@ -349,7 +349,7 @@ def test_mounting_and_index_error_of_a_rangefinder_are_estimated():
     true_place, index = model.rangefinders[0].pose, 3e-3
     beam, rng = bar @ matrix(true_place), np.random.default_rng(5)
     rows, distance = [], []
-    for epoch, pose in enumerate(known.truth["world_from_target"][1:]):
+    for epoch, pose in enumerate(known.truth["carrier_from_target"][1:]):
         rows += [(epoch, point) for point in (-1, *range(len(plate)))]
         distance += [to_plane(beam, matrix(pose))]
         distance += [to_point(beam, matrix(pose), mark) for mark in plate]

@@ -274,7 +274,7 @@ def test_ranges_by_hand(stereo):
     kinds = set()
     for k in range(len(got)):
         row = scene.target_row[ranges.target[k], ranges.epoch[k]]
-        pose = matrix(state.world_from_target[row])
+        pose = matrix(state.carrier_from_target[row])
         if ranges.point[k] < 0:
             distance = to_plane(beam, pose)
         else:
@@ -293,16 +293,16 @@ def test_links_by_hand(relay):
     nodes = {("station", i): pose for i, pose in enumerate(stations)}
     for i in range(3):
         nodes["camera", i] = stations[i] @ matrix(state.station_from_camera[i])
-        nodes["target", i] = matrix(state.world_from_target[i])
+        nodes["target", i] = matrix(state.carrier_from_target[i])
     for k in range(2):
         a, b = nodes[links.from_node[k]], nodes[links.to_node[k]]
         expected = twist(np.linalg.inv(matrix(links.pose[k])) @ np.linalg.inv(a) @ b)
-        expected /= np.repeat([links.sigma_rad[k], links.sigma_m[k]], 3)
+        expected /= links.sigma[k]
         assert np.allclose(blocks.links[k], expected, rtol=1e-8, atol=1e-8)
         assert np.abs(expected).min() > 1e-2
     for k in range(3):
         own = np.linalg.inv(matrix(links.pose[2 + k])) @ matrix(state.link[k])
-        expected = twist(own) / np.repeat([links.sigma_rad[2 + k], links.sigma_m[2 + k]], 3)
+        expected = twist(own) / links.sigma[2 + k]
         assert np.allclose(blocks.edges[k], expected, rtol=1e-8, atol=1e-8)
 
 
@@ -336,7 +336,7 @@ def test_priors_by_hand():
     expected = [
         (known.truth["focal"][0] - [990.0, 1000.0]) / [2.0, 5.0],
         (known.truth["distortion"][0, :4] - [0.1, 0.2, 0.3, 0.4]) / 0.01,
-        ((known.truth["world_from_target"] - np.arange(6.0)) / np.arange(1.0, 7.0)).ravel(),
+        ((known.truth["carrier_from_target"] - np.arange(6.0)) / np.arange(1.0, 7.0)).ravel(),
         np.full(6, -5.0),
     ]
     assert np.allclose(got, np.concatenate(expected), rtol=1e-12)

@@ -41,7 +41,7 @@ def test_start_ends_where_the_truth_ends(name):
 def test_start_is_near_without_any_adjustment():
     known = stereo_recording(noise=0.0)
     begun = start(build(without_starts(known.recording)))
-    for field, tolerance in [("world_from_station", 0.2), ("world_from_target", 0.2)]:
+    for field, tolerance in [("world_from_station", 0.2), ("carrier_from_target", 0.2)]:
         apart = np.asarray(getattr(begun.state, field)) - known.truth[field]
         assert np.abs(apart).max() < tolerance, field
     ratio = np.asarray(begun.state.focal) / known.truth["focal"]
@@ -59,7 +59,7 @@ def test_what_the_model_gives_is_kept():
     assert not np.array_equal(begun.state.focal[0], known.truth["focal"][0])
     # Held bodies stand where the model puts them.
     assert np.array_equal(begun.state.station_from_camera[0], HELD)
-    assert np.array_equal(begun.state.world_from_target[0], HELD)
+    assert np.array_equal(begun.state.carrier_from_target[0], HELD)
 
 
 def test_links_carry_the_start():
@@ -67,8 +67,8 @@ def test_links_carry_the_start():
     begun = start(build(without_starts(known.recording)))
     place = np.asarray(begun.state.world_from_station)
     assert np.allclose(place, known.truth["world_from_station"], atol=1e-6)
-    target = np.asarray(begun.state.world_from_target)
-    assert np.allclose(target, known.truth["world_from_target"], atol=1e-6)
+    target = np.asarray(begun.state.carrier_from_target)
+    assert np.allclose(target, known.truth["carrier_from_target"], atol=1e-6)
 
 
 def test_no_chain_reaches_a_station():
@@ -135,7 +135,7 @@ def test_unseen_bodies_with_a_known_pose_need_no_view():
     )
     begun = start(build(replace(blind, model=model)))
     assert np.allclose(begun.state.world_from_station[1], 0.1)
-    assert np.allclose(begun.state.world_from_target[-1], 0.2)
+    assert np.allclose(begun.state.carrier_from_target[-1], 0.2)
 
 
 def thinned(obs, keep):

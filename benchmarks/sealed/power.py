@@ -247,14 +247,14 @@ def rolled(scene: Scene) -> bool:
     """Whether any target's x axis leaves the rows of any camera's image by over ROLL_DEG."""
     turn = {
         name: Rotation.from_rotvec(np.array(getattr(scene.state, name))[:, :3])
-        for name in ("station_from_camera", "world_from_station", "world_from_target")
+        for name in ("station_from_camera", "world_from_station", "carrier_from_target")
     }
     stations = [s.name for s in scene.model.stations]
     for c, camera in enumerate(scene.model.cameras):
         station = turn["world_from_station"][scene.station_row[stations.index(camera.station)]]
         camera_from_world = (station * turn["station_from_camera"][c]).inv()
         for rows in scene.target_row:
-            x_axis = (camera_from_world * turn["world_from_target"][rows]).as_matrix()[..., 0]
+            x_axis = (camera_from_world * turn["carrier_from_target"][rows]).as_matrix()[..., 0]
             lean = np.abs(np.arctan2(x_axis[..., 1], np.abs(x_axis[..., 0])))
             if np.degrees(lean).max() > ROLL_DEG:
                 return True

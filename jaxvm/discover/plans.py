@@ -225,14 +225,15 @@ def _eye(scene: Scene) -> np.ndarray:
 
 def _with_poses(plan: Plan, scene: Scene):
     assert plan.poses is not None
-    table = np.array(scene.state.world_from_target)
-    moving = [i for i, t in enumerate(scene.model.targets) if t.motion == "per-epoch"]
+    table = np.array(scene.state.carrier_from_target)
+    targets = enumerate(scene.model.targets)
+    moving = [i for i, t in targets if t.motion == "per-epoch" and not t.station]
     rows = scene.target_row[moving]
     up = np.asarray(scene.model.up, float)
     middles = [scene.model.targets[i].points for i in moving]
     middles = np.array([0.5 * (p.min(axis=0) + p.max(axis=0)) for p in middles])
     table[rows] = plan.poses(table[rows], middles, _eye(scene), up)
-    return eqx.tree_at(lambda s: s.world_from_target, scene.state, jnp.asarray(table))
+    return eqx.tree_at(lambda s: s.carrier_from_target, scene.state, jnp.asarray(table))
 
 
 def _in_front(scene: Scene, rows: np.ndarray) -> np.ndarray:
@@ -242,12 +243,11 @@ def _in_front(scene: Scene, rows: np.ndarray) -> np.ndarray:
     station = np.array([names.index(c.station) for c in scene.model.cameras])
     camera, epoch, target = obs.camera[rows], obs.epoch[rows], obs.target[rows]
     point = np.asarray(state.point)[scene.first_point[target] + obs.point[rows]]
-    for table, row, outward in (
-        (state.world_from_target, scene.target_row[target, epoch], True),
-        (state.world_from_station, scene.station_row[station[camera], epoch], False),
-        (state.station_from_camera, camera, False),
+    for pose, outward in (
+        (scene.world_from_targets(target, epoch), True),
+        (np.array(state.world_from_station)[scene.station_row[station[camera], epoch]], False),
+        (np.array(state.station_from_camera)[camera], False),
     ):
-        pose = np.array(table)[row]
         turn = Rotation.from_rotvec(pose[:, :3])
         if outward:
             point = turn.apply(point) + pose[:, 3:]

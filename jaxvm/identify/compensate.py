@@ -145,7 +145,7 @@ def port_columns(
 
     def one(own, z):
         ray = unproject(family, focal, centre, coefficients, own)
-        sight = Sight(focal, centre, coefficients, none, none, none, ray / ray[2] * z)
+        sight = Sight(focal, centre, coefficients, none, none, none, none, ray / ray[2] * z)
         zero = jnp.zeros(())
         still = Circumstances(
             own, zero + 1.0, jnp.zeros(3), jnp.ones(2), zero, zero, zero, zero, none

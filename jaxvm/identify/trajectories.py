@@ -192,14 +192,13 @@ def depths(scene: Scene) -> Float[np.ndarray, " observations"]:
     obs, state = scene.recording.observations, scene.state
     names = [s.name for s in scene.model.stations]
     station = np.array([names.index(c.station) for c in scene.model.cameras])[obs.camera]
-    rows = (
-        (state.station_from_camera, obs.camera),
-        (state.world_from_station, scene.station_row[station, obs.epoch]),
-        (state.world_from_target, scene.target_row[obs.target, obs.epoch]),
-    )
-    poses = [jnp.asarray(np.asarray(table)[own]) for table, own in rows]
+    poses = [
+        np.asarray(state.station_from_camera)[obs.camera],
+        np.asarray(state.world_from_station)[scene.station_row[station, obs.epoch]],
+        scene.world_from_targets(obs.target, obs.epoch),
+    ]
     point = np.asarray(state.point)[scene.first_point[obs.target] + obs.point]
-    return np.asarray(_depths(*poses, jnp.asarray(point)))
+    return np.asarray(_depths(*map(jnp.asarray, (*poses, point))))
 
 
 @jax.jit

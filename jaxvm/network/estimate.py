@@ -38,7 +38,7 @@ def estimated_model(scene: Scene) -> Model:
             )
         )
     stations = pose_of(model.stations, scene.station_row, state.world_from_station)
-    targets = pose_of(model.targets, scene.target_row, state.world_from_target)
+    targets = pose_of(model.targets, scene.target_row, state.carrier_from_target)
     point = np.asarray(state.point)
     targets = tuple(
         replace(target, points=point[scene.first_point[i] : scene.first_point[i + 1]])
@@ -66,7 +66,7 @@ def pose_table(scene: Scene, deviations: State) -> pd.DataFrame:
     rows = []
     for kind, bodies, row_of, table in (
         ("station", scene.model.stations, scene.station_row, "world_from_station"),
-        ("target", scene.model.targets, scene.target_row, "world_from_target"),
+        ("target", scene.model.targets, scene.target_row, "carrier_from_target"),
     ):
         values = np.asarray(getattr(scene.state, table))
         spread = np.asarray(getattr(deviations, table))

@@ -8,6 +8,7 @@ after the other; the block Jacobian comes from the same local functions (`jaxvm.
 import abc
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
@@ -90,7 +91,7 @@ class PixelFactor(Factor):
 
     @property
     def widths(self):
-        return (2, 2, self.family.n_coefficients, 6, 6, 6, 3)
+        return (2, 2, self.family.n_coefficients, 6, 6, 6, 6, 3)
 
     def local(self, own, data, ports):
         return predict_pixel(self.family, Sight(*own), data, ports) - data.pixel
@@ -116,7 +117,7 @@ class RangeFactor(Factor):
 
     @property
     def widths(self):
-        return (6, 6, 6, 3)
+        return (6, 6, 6, 6, 3)
 
     def local(self, own, data, ports):
         circumstances, to_plane, measured = data
@@ -127,44 +128,51 @@ class LinkFactor(Factor):
     """Measured or calibrated relative poses: log(measured^-1 . from^-1 . to), turn then shift.
 
     A node is a body on a carrier (a camera on its station); one that is its own carrier has the
-    identity as its second pose.
+    identity as its second pose. `root` is a square root of the information: root^T root = C^-1, so
+    that what comes out is whitened already and sigma is one.
     """
 
     slots: Int[Array, "observations 24"]
     sigma: Float[Array, "observations 6"]
     weight: Float[Array, " observations"]
     measured: Float[Array, "observations 6"]
+    root: Float[Array, "observations 6 6"]
 
     def data(self):
-        return self.measured
+        return self.measured, self.root
 
     @property
     def widths(self):
         return (6, 6, 6, 6)
 
     def local(self, own, data, ports):
+        measured, root = data
         poses = [pose_from_vector(vector) for vector in own]
         world_from_a, world_from_b = poses[0] @ poses[1], poses[2] @ poses[3]
-        return se3_log(pose_from_vector(data).inverse() @ world_from_a.inverse() @ world_from_b)
+        return root @ se3_log(
+            pose_from_vector(measured).inverse() @ world_from_a.inverse() @ world_from_b
+        )
 
 
 class EdgeFactor(Factor):
-    """Measured relative poses that are unknowns themselves: log(measured^-1 . link)."""
+    """Measured relative poses that are unknowns themselves: log(measured^-1 . link), whitened."""
 
     slots: Int[Array, "observations 6"]
     sigma: Float[Array, "observations 6"]
     weight: Float[Array, " observations"]
     measured: Float[Array, "observations 6"]
+    root: Float[Array, "observations 6 6"]
 
     def data(self):
-        return self.measured
+        return self.measured, self.root
 
     @property
     def widths(self):
         return (6,)
 
     def local(self, own, data, ports):
-        return se3_log(pose_from_vector(data).inverse() @ pose_from_vector(own[0]))
+        measured, root = data
+        return root @ se3_log(pose_from_vector(measured).inverse() @ pose_from_vector(own[0]))
 
 
 class ClosureFactor(Factor):
@@ -186,15 +194,17 @@ class ClosureFactor(Factor):
         return (6,) * (self.slots.shape[1] // 6)
 
     def local(self, own, data, ports):
-        product = Pose.identity()
-        for vector, sign in zip(own, data, strict=True):
-            link = pose_from_vector(vector)
-            back = link.inverse()
-            ahead = sign > 0.0
-            product = product @ Pose(
-                jnp.where(ahead, link.rotation, back.rotation),
-                jnp.where(ahead, link.shift, back.shift),
-            )
+        links = jax.vmap(pose_from_vector)(jnp.stack(own))
+        back = jax.vmap(Pose.inverse)(links)
+        ahead = data > 0.0
+        walked = Pose(
+            jnp.where(ahead[:, None, None], links.rotation, back.rotation),
+            jnp.where(ahead[:, None], links.shift, back.shift),
+        )
+        # A scan, so that a loop of a thousand links is no longer a program than one of three.
+        product, _ = jax.lax.scan(
+            lambda so_far, link: (so_far @ link, None), Pose.identity(), walked
+        )
         return se3_log(product)
 
 

@@ -5,10 +5,13 @@ that every result can say of which camera, target and epoch it speaks.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
 
 from jaxvm.network.binding import bind
 from jaxvm.network.residual import Network
@@ -78,6 +81,32 @@ class Scene:
     def room(self) -> tuple[int, int]:
         """Columns and constants that there is room for."""
         return self.network.effects.n_columns, self.state.constant.shape[0]
+
+    @cached_property
+    def station_places(self) -> dict[str, int]:
+        """Place of each station in the model, by name."""
+        return {station.name: i for i, station in enumerate(self.model.stations)}
+
+    def world_from_targets(
+        self, target: Int[np.ndarray, " n"], epoch: Int[np.ndarray, " n"]
+    ) -> Float[np.ndarray, "n 6"]:
+        """Present poses of targets in the world, whatever carries them."""
+        pose = np.array(self.state.carrier_from_target)[self.target_row[target, epoch]]
+        row = self.carrier_rows(target, epoch)
+        carrier = np.array(self.state.world_from_station)[np.maximum(row, 0)]
+        carrier[row < 0] = 0.0
+        turn, own = Rotation.from_rotvec(carrier[:, :3]), Rotation.from_rotvec(pose[:, :3])
+        shift = turn.apply(pose[:, 3:]) + carrier[:, 3:]
+        return np.concatenate([(turn * own).as_rotvec(), shift], axis=1)
+
+    def carrier_rows(
+        self, target: Int[np.ndarray, " n"], epoch: Int[np.ndarray, " n"]
+    ) -> Int[np.ndarray, " n"]:
+        """Row of world_from_station for the station that carries a target; -1 for the world."""
+        places = self.station_places
+        carrier = np.array([places.get(t.station, -1) for t in self.model.targets], int)
+        own = carrier[target]
+        return np.where(own < 0, -1, self.station_row[own, epoch])
 
     def places(self) -> tuple[tuple[slice, slice], ...]:
         """Columns and constants of each effect, in the tables of amplitudes and constants."""
@@ -189,8 +218,10 @@ def _given_state(recording, station_row, target_row) -> State:
         distortion=jnp.asarray(distortion),
         station_from_camera=jnp.asarray(mounted),
         world_from_station=jnp.asarray(poses(model.stations, station_row)),
-        world_from_target=jnp.asarray(poses(model.targets, target_row)),
-        point=jnp.asarray(_in_room(np.concatenate([t.points for t in model.targets]))),
+        carrier_from_target=jnp.asarray(poses(model.targets, target_row)),
+        point=jnp.asarray(
+            _in_room(np.concatenate([np.zeros((0, 3)), *(t.points for t in model.targets)]))
+        ),
         station_from_rangefinder=jnp.asarray(np.reshape(finders, (-1, 6)).astype(float)),
         link=jnp.asarray(np.zeros((0, 6)) if links is None or not named else links.pose[named]),
         amplitude=jnp.zeros(0),
@@ -212,10 +243,8 @@ def _relaid(network: Network, old: Layout, new: Layout) -> Network:
     def shift(slots):
         return jnp.where(slots >= old.offset("identity"), slots + moved, slots)
 
-    for name in ("links", "closures"):
-        factor = getattr(network, name)
-        if factor is not None:
-            network = eqx.tree_at(
-                lambda n, name=name: getattr(n, name).slots, network, shift(factor.slots)
-            )
+    def slots(n):
+        return [f.slots for f in (*n.pixels, n.ranges, n.links, n.closures) if f is not None]
+
+    network = eqx.tree_at(slots, network, [shift(own) for own in slots(network)])
     return replace(network, layout=new)

@@ -80,7 +80,6 @@ def _vector(pose: np.ndarray) -> np.ndarray:
 def _view_relations(scene: Scene, views: list[View]):
     """Relations (chain of keys a, chain of keys b, a_from_b, error) of all views."""
     relations = []
-    names = [s.name for s in scene.model.stations]
     focal, centre = np.asarray(scene.state.focal), np.asarray(scene.state.centre)
     distortion = np.asarray(scene.state.distortion)
     families = [lens_family(camera.lens) for camera in scene.model.cameras]
@@ -102,9 +101,8 @@ def _view_relations(scene: Scene, views: list[View]):
         found = pose_of_view(view.points[sound], of_view[sound])
         if found is None:
             continue
-        station = names.index(scene.model.cameras[view.camera].station)
-        a = (("station", scene.station_row[station, view.epoch]), ("camera", view.camera))
-        b = (("target", scene.target_row[view.target, view.epoch]),)
+        a = _keys(scene, "camera", view.camera, view.epoch)
+        b = _keys(scene, "target", view.target, view.epoch)
         relations.append((a, b, _matrix(found[0]), found[1] / np.sqrt(len(of_view))))
     return relations
 
@@ -113,26 +111,29 @@ def _link_relations(scene: Scene):
     links = scene.recording.links
     if links is None:
         return []
-    names = [s.name for s in scene.model.stations]
-
-    def chain(node, epoch):
-        kind, number = node
-        epoch = max(epoch, 0)
-        if kind == "camera":
-            station = names.index(scene.model.cameras[number].station)
-            return (("station", scene.station_row[station, epoch]), ("camera", number))
-        row = (scene.station_row if kind == "station" else scene.target_row)[number, epoch]
-        return ((kind, row),)
-
+    sigma = links.sigma[:, :3].max(axis=1)
+    epoch = np.maximum(links.epoch, 0)
     return [
         (
-            chain(links.from_node[i], links.epoch[i]),
-            chain(links.to_node[i], links.epoch[i]),
+            _keys(scene, *links.from_node[i], epoch[i]),
+            _keys(scene, *links.to_node[i], epoch[i]),
             _matrix(links.pose[i]),
-            float(links.sigma_rad[i]),
+            float(sigma[i]),
         )
         for i in range(len(links.name))
     ]
+
+
+def _keys(scene: Scene, kind: str, number: int, epoch: int) -> tuple[tuple[str, int], ...]:
+    """Keys of the poses that make up the pose of a node in the world, carriers first."""
+    if kind == "station":
+        return (("station", int(scene.station_row[number, epoch])),)
+    bodies = scene.model.cameras if kind == "camera" else scene.model.targets
+    own = (kind, number if kind == "camera" else int(scene.target_row[number, epoch]))
+    carrier = bodies[number].station
+    if not carrier:
+        return (own,)
+    return (("station", int(scene.station_row[scene.station_places[carrier], epoch])), own)
 
 
 def _given(scene: Scene) -> dict[tuple[str, int], np.ndarray]:
@@ -144,7 +145,7 @@ def _given(scene: Scene) -> dict[tuple[str, int], np.ndarray]:
             known["camera", i] = _matrix(np.asarray(scene.state.station_from_camera[i]))
     for kind, bodies, rows, table in (
         ("station", model.stations, scene.station_row, scene.state.world_from_station),
-        ("target", model.targets, scene.target_row, scene.state.world_from_target),
+        ("target", model.targets, scene.target_row, scene.state.carrier_from_target),
     ):
         values = np.asarray(table)
         for i, body in enumerate(bodies):
@@ -157,25 +158,40 @@ def _given(scene: Scene) -> dict[tuple[str, int], np.ndarray]:
 def _chain(scene: Scene, relations) -> dict[tuple[str, int], np.ndarray]:
     """Propagate known poses through the relations, best ones first."""
     known = _given(scene)
-    if not any(key[0] in ("station", "target") for key in known) and relations:
+    in_world = {key for key in known if _stands_in_world(scene, key)}
+    if not in_world and relations:
         known[relations[0][0][0]] = np.eye(4)
-    waiting = list(relations)
-    while waiting:
-        candidates, rest = defaultdict(list), []
-        for relation in waiting:
-            a, b, a_from_b, error = relation
-            missing = [key for key in (*a, *b) if key not in known]
-            if len(missing) == 1:
-                candidates[missing[0]].append((error, _solve(a, b, a_from_b, missing[0], known)))
-            elif len(missing) > 1:
-                rest.append(relation)
-        if not candidates:
-            break
+    of_key = defaultdict(list)
+    missing = []
+    for k, (a, b, _, _) in enumerate(relations):
+        missing.append({key for key in (*a, *b) if key not in known})
+        for key in missing[k]:
+            of_key[key].append(k)
+    ready = [k for k, keys in enumerate(missing) if len(keys) == 1]
+    # Round by round, so that a pose that several relations give is chosen among all of them.
+    while ready:
+        candidates = defaultdict(list)
+        for k in ready:
+            a, b, a_from_b, error = relations[k]
+            (key,) = missing[k]
+            candidates[key].append((error, _solve(a, b, a_from_b, key, known)))
+        touched = set()
         for key, options in candidates.items():
             known[key] = _consensus(options)
-        waiting = rest
-    _check_reached(scene, known, waiting)
+            for k in of_key[key]:
+                missing[k].discard(key)
+                touched.add(k)
+        ready = sorted(k for k in touched if len(missing[k]) == 1)
+    _check_reached(scene, known, [relations[k] for k, keys in enumerate(missing) if keys])
     return known
+
+
+def _stands_in_world(scene: Scene, key: tuple[str, int]) -> bool:
+    """Whether a pose says where a body is in the world, not on what it is mounted."""
+    kind, row = key
+    if kind == "target":
+        return not scene.model.targets[int(np.argmax((scene.target_row == row).any(1)))].station
+    return kind == "station"
 
 
 def _solve(a, b, a_from_b, key, known) -> np.ndarray:
@@ -234,13 +250,14 @@ def _check_reached(scene: Scene, known, waiting) -> None:
 def _observed(scene: Scene) -> set[tuple[str, int]]:
     """Keys of all bodies that an image point depends on."""
     obs, model = scene.recording.observations, scene.model
-    names = [s.name for s in model.stations]
-    station_of = np.array([names.index(c.station) for c in model.cameras], int)
+    places = scene.station_places
+    station_of = np.array([places[c.station] for c in model.cameras], int)
+    rows = np.append(
+        scene.station_row[station_of[obs.camera], obs.epoch],
+        scene.carrier_rows(obs.target, obs.epoch),
+    )
     keys = {("camera", int(i)) for i in np.unique(obs.camera)}
-    keys |= {
-        ("station", int(row))
-        for row in np.unique(scene.station_row[station_of[obs.camera], obs.epoch])
-    }
+    keys |= {("station", int(row)) for row in np.unique(rows[rows >= 0])}
     return keys | {
         ("target", int(row)) for row in np.unique(scene.target_row[obs.target, obs.epoch])
     }
@@ -250,7 +267,7 @@ def _with_poses(scene: Scene, known) -> Scene:
     tables = {
         "camera": np.array(scene.state.station_from_camera),
         "station": np.array(scene.state.world_from_station),
-        "target": np.array(scene.state.world_from_target),
+        "target": np.array(scene.state.carrier_from_target),
     }
     reached = {kind: np.zeros(len(table), bool) for kind, table in tables.items()}
     for (kind, row), pose in known.items():
@@ -264,7 +281,7 @@ def _with_poses(scene: Scene, known) -> Scene:
             _fill_gaps(tables[kind], reached[kind], rows[i])
             _unwrap(tables[kind], rows[i])
     state = eqx.tree_at(
-        lambda s: (s.station_from_camera, s.world_from_station, s.world_from_target),
+        lambda s: (s.station_from_camera, s.world_from_station, s.carrier_from_target),
         scene.state,
         tuple(jnp.asarray(tables[kind]) for kind in ("camera", "station", "target")),
     )
@@ -294,6 +311,7 @@ def _triangulated(scene: Scene) -> Scene:
     obs, model, state = scene.recording.observations, scene.model, scene.state
     names = [s.name for s in model.stations]
     row = scene.first_point[obs.target] + obs.point
+    world_from_target = scene.world_from_targets(obs.target, obs.epoch)
     normal, right = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
     count = np.zeros(len(points), int)
     for i, camera in enumerate(model.cameras):
@@ -310,10 +328,7 @@ def _triangulated(scene: Scene) -> Scene:
             carrier = _matrix(
                 np.asarray(state.world_from_station[scene.station_row[station, obs.epoch[k]]])
             )
-            target = _matrix(
-                np.asarray(state.world_from_target[scene.target_row[obs.target[k], obs.epoch[k]]])
-            )
-            pose = np.linalg.inv(target) @ carrier @ mounted
+            pose = np.linalg.inv(_matrix(world_from_target[k])) @ carrier @ mounted
             direction = pose[:3, :3] @ (ray / np.linalg.norm(ray))
             across = np.eye(3) - np.outer(direction, direction)
             normal[row[k]] += across

@@ -24,13 +24,13 @@ class State(eqx.Module):
     distortion: Float[Array, "cameras 14"]  # OpenCV's order
     station_from_camera: Float[Array, "cameras 6"]
     world_from_station: Float[Array, "station_rows 6"]
-    world_from_target: Float[Array, "target_rows 6"]
+    carrier_from_target: Float[Array, "target_rows 6"]  # carrier: its station, else the world
     point: Float[Array, "points 3"]  # target coordinates, m
     station_from_rangefinder: Float[Array, "rangefinders 6"]
     link: Float[Array, "closed_links 6"]  # relative poses that take part in loop closures
     amplitude: Float[Array, " columns"]  # of effects
     constant: Float[Array, " constants"]  # of effects; the last is always 1
-    identity: Float[Array, "1 6"]  # the pose of a node that is its own carrier
+    identity: Float[Array, "1 6"]  # pose of the world, and of a node that is its own carrier
 
     def flatten(self) -> Float[Array, " n"]:
         """All values as one vector, in the order of the fields."""

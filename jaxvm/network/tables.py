@@ -29,6 +29,7 @@ class Tables:
     """Turns the names and indices of a recording into slots of the flat state."""
 
     def __init__(self, scene: Scene):
+        self.scene = scene
         self.recording = scene.recording
         self.model = scene.model
         self.layout = scene.network.layout
@@ -49,7 +50,9 @@ class Tables:
         self.centre = np.array([(p.min(0) + p.max(0)) / 2 for p in points])
         half = np.array([np.ptp(p, axis=0)[:2] / 2 for p in points])
         self.half_size = np.where(half > 0, half, 1.0)
-        self.checker = np.concatenate([checker(t.points) for t in self.model.targets])
+        self.checker = np.concatenate(
+            [np.zeros(0), *(checker(t.points) for t in self.model.targets)]
+        )
         self.along_beam = along_beam(
             self.station_of, np.asarray(scene.state.station_from_camera)[:, 3:]
         )
@@ -104,7 +107,8 @@ class Tables:
                 self.layout.slots(
                     "world_from_station", self.station_row[self.station_of[camera], epoch]
                 ),
-                self.layout.slots("world_from_target", self.target_row[target, epoch]),
+                self._carriers(target, epoch),
+                self.layout.slots("carrier_from_target", self.target_row[target, epoch]),
                 self.layout.slots("point", point),
             ]
             height = np.array([c.image_size[1] for c in self.model.cameras], float)[camera]
@@ -135,7 +139,8 @@ class Tables:
         slots = [
             self.layout.slots("station_from_rangefinder", ranges.rangefinder),
             self.layout.slots("world_from_station", self.station_row[station, ranges.epoch]),
-            self.layout.slots("world_from_target", self.target_row[ranges.target, ranges.epoch]),
+            self._carriers(ranges.target, ranges.epoch),
+            self.layout.slots("carrier_from_target", self.target_row[ranges.target, ranges.epoch]),
             self.layout.slots("point", point),
         ]
         n = len(ranges.epoch)
@@ -152,21 +157,35 @@ class Tables:
             pattern=jnp.zeros((n, 0)),
         )
 
-    def _node(self, kind: str, number: int, epoch: int) -> np.ndarray:
-        """Slots of a node: carrier, then body on the carrier."""
-        epoch = max(epoch, 0)
-        identity = self.layout.slots("identity", np.zeros(1, int))[0]
-        if kind == "camera":
-            row = self.station_row[self.station_of[number], epoch]
-            carrier = self.layout.slots("world_from_station", np.array([row]))[0]
-            body = self.layout.slots("station_from_camera", np.array([number]))[0]
-            return np.concatenate([carrier, body])
-        rows, table = {
-            "station": (self.station_row, "world_from_station"),
-            "target": (self.target_row, "world_from_target"),
-        }[kind]
-        own = self.layout.slots(table, np.array([rows[number, epoch]]))[0]
-        return np.concatenate([own, identity])
+    def _carriers(self, target, epoch) -> np.ndarray:
+        """Slots of what carries targets: their stations, or the world."""
+        row = self.scene.carrier_rows(target, epoch)
+        slots = self.layout.slots("world_from_station", np.maximum(row, 0))
+        world = self.layout.slots("identity", np.zeros(1, int))
+        return np.where(row[:, None] < 0, world, slots)
+
+    def _nodes(self, nodes: list[tuple[str, int]], epoch: np.ndarray) -> np.ndarray:
+        """Slots of nodes: carrier, then body on the carrier."""
+        kind = np.array([kind for kind, _ in nodes], object)
+        number = np.array([number for _, number in nodes], int)
+        epoch = np.maximum(epoch, 0)
+        slots = np.tile(self.layout.slots("identity", np.zeros(1, int)), (len(nodes), 2))
+        for name in ("camera", "station", "target"):
+            own = np.flatnonzero(kind == name)
+            which, when = number[own], epoch[own]
+            if name == "station":
+                row = self.station_row[which, when]
+                slots[own, :6] = self.layout.slots("world_from_station", row)
+            elif name == "camera":
+                row = self.station_row[self.station_of[which], when]
+                slots[own, :6] = self.layout.slots("world_from_station", row)
+                slots[own, 6:] = self.layout.slots("station_from_camera", which)
+            else:
+                slots[own, :6] = self._carriers(which, when)
+                slots[own, 6:] = self.layout.slots(
+                    "carrier_from_target", self.target_row[which, when]
+                )
+        return slots
 
     def _split_links(self):
         links = self.recording.links
@@ -179,21 +198,13 @@ class Tables:
         links = self.recording.links
         if links is None or len(links.name) == 0:
             return None
-        rows = np.arange(len(links.name))
-        slots = [
-            np.concatenate(
-                [
-                    self._node(*links.from_node[i], links.epoch[i]),
-                    self._node(*links.to_node[i], links.epoch[i]),
-                ]
-            )
-            for i in rows
-        ]
+        ends = [self._nodes(nodes, links.epoch) for nodes in (links.from_node, links.to_node)]
         return LinkFactor(
-            slots=jnp.asarray(np.stack(slots)),
-            sigma=jnp.asarray(_pose_sigma(links.sigma_rad[rows], links.sigma_m[rows])),
-            weight=jnp.ones(len(rows)),
-            measured=jnp.asarray(links.pose[rows]),
+            slots=jnp.asarray(np.concatenate(ends, axis=1)),
+            sigma=jnp.ones((len(links.name), 6)),
+            weight=jnp.ones(len(links.name)),
+            measured=jnp.asarray(links.pose),
+            root=jnp.asarray(information_root(links.covariance)),
         )
 
     def closed_links(self) -> tuple[EdgeFactor | None, ClosureFactor | None]:
@@ -204,9 +215,10 @@ class Tables:
         place = {links.name[i]: k for k, i in enumerate(rows)}
         edges = EdgeFactor(
             slots=jnp.asarray(self.layout.slots("link", np.arange(len(rows)))),
-            sigma=jnp.asarray(_pose_sigma(links.sigma_rad[rows], links.sigma_m[rows])),
+            sigma=jnp.ones((len(rows), 6)),
             weight=jnp.ones(len(rows)),
             measured=jnp.asarray(links.pose[rows]),
+            root=jnp.asarray(information_root(links.covariance[rows])),
         )
         closures = self.model.closures
         longest = max(len(closure.links) for closure in closures)
@@ -218,9 +230,7 @@ class Tables:
                 own = self.layout.slots("link", np.array([place[name]]))[0]
                 slots[i, 6 * k : 6 * k + 6] = own
                 forward[i, k] = sign
-        sigma = _pose_sigma(
-            np.array([c.sigma_rad for c in closures]), np.array([c.sigma_m for c in closures])
-        )
+        sigma = np.repeat([[c.sigma_rad, c.sigma_m] for c in closures], 3, axis=1)
         return edges, ClosureFactor(
             slots=jnp.asarray(slots),
             sigma=jnp.asarray(sigma),
@@ -246,7 +256,7 @@ class Tables:
                 table, rows = "station_from_rangefinder", np.array([body])
             else:
                 of_body = self.station_row if kind == "stations" else self.target_row
-                table = "world_from_station" if kind == "stations" else "world_from_target"
+                table = "world_from_station" if kind == "stations" else "carrier_from_target"
                 rows = np.unique(of_body[body])
             slots.append(self.layout.slots(table, rows, width).ravel())
             expected.append(np.tile(prior.value, len(rows)))
@@ -262,10 +272,10 @@ class Tables:
         )
 
 
-def _pose_sigma(sigma_rad: np.ndarray, sigma_m: np.ndarray) -> np.ndarray:
-    return np.concatenate(
-        [np.repeat(sigma_rad[:, None], 3, axis=1), np.repeat(sigma_m[:, None], 3, axis=1)], axis=1
-    )
+def information_root(covariance: Float[np.ndarray, "n 6 6"]) -> Float[np.ndarray, "n 6 6"]:
+    """Upper triangles R with R^T R = C^-1."""
+    flipped = np.linalg.cholesky(covariance[:, ::-1, ::-1])[:, ::-1, ::-1]
+    return np.linalg.inv(flipped)
 
 
 def along_beam(

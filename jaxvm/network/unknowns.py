@@ -168,7 +168,7 @@ def free_unknowns(scene: Scene) -> Unknowns:
     ids = scene.recording.epoch_ids
     bodies = [
         ("station", model.stations, scene.station_row, "world_from_station"),
-        ("target", model.targets, scene.target_row, "world_from_target"),
+        ("target", model.targets, scene.target_row, "carrier_from_target"),
     ]
     for kind, of_kind, rows, table in bodies:
         for i, body in enumerate(of_kind):
@@ -253,9 +253,12 @@ def _epochs_seen(scene: Scene, kind: str, number: int) -> np.ndarray:
     """Epochs in which a moving body is touched by any observation."""
     obs, model = scene.recording.observations, scene.model
     seen = np.zeros(len(scene.recording.time), bool)
-    names = [s.name for s in model.stations]
-    station_of = np.array([names.index(c.station) for c in model.cameras])
-    own = obs.target == number if kind == "target" else station_of[obs.camera] == number
+    if kind == "target":
+        own = obs.target == number
+    else:
+        carries = np.array([c.station == model.stations[number].name for c in model.cameras])
+        bears = np.array([t.station == model.stations[number].name for t in model.targets])
+        own = carries[obs.camera] | bears[obs.target]
     seen[obs.epoch[own]] = True
     links = scene.recording.links
     if links is not None:

@@ -28,8 +28,16 @@ class Sight(NamedTuple):
     distortion: Float[Array, " coefficients"]
     station_from_camera: Float[Array, "6"]
     world_from_station: Float[Array, "6"]
-    world_from_target: Float[Array, "6"]
+    world_from_carrier: Float[Array, "6"]  # of the target: a station, or the world itself
+    carrier_from_target: Float[Array, "6"]
     point: Float[Array, "3"]
+
+    @property
+    def world_from_target(self) -> Pose:
+        """Pose of the target."""
+        return pose_from_vector(self.world_from_carrier) @ pose_from_vector(
+            self.carrier_from_target
+        )
 
 
 class Circumstances(NamedTuple):
@@ -221,7 +229,7 @@ def predict_pixel(
     at = circumstances
     target = mark(sight.point, at.target_centre, at.target_half_size, ports)
     delay = exposure_delay(at.pixel, at.image_height, ports)
-    world = place(pose_from_vector(sight.world_from_target), target, delay, at.velocity, ports)
+    world = place(sight.world_from_target, target, delay, at.velocity, ports)
     camera = look(
         pose_from_vector(sight.world_from_station),
         pose_from_vector(sight.station_from_camera),
@@ -242,8 +250,16 @@ class Aim(NamedTuple):
 
     station_from_rangefinder: Float[Array, "6"]
     world_from_station: Float[Array, "6"]
-    world_from_target: Float[Array, "6"]
+    world_from_carrier: Float[Array, "6"]
+    carrier_from_target: Float[Array, "6"]
     point: Float[Array, "3"]
+
+    @property
+    def world_from_target(self) -> Pose:
+        """Pose of the target."""
+        return pose_from_vector(self.world_from_carrier) @ pose_from_vector(
+            self.carrier_from_target
+        )
 
 
 def predict_range(
@@ -260,7 +276,7 @@ def predict_range(
     at = circumstances
     point = jnp.where(to_plane > 0.5, aim.point.at[2].set(0.0), aim.point)
     target = mark(point, at.target_centre, at.target_half_size, ports)
-    pose = pose_from_vector(aim.world_from_target)
+    pose = aim.world_from_target
     delay = ports["clock.offset"]
     seen = look(
         pose_from_vector(aim.world_from_station),

@@ -129,7 +129,7 @@ def observation_drivers(
     targets', `epoch` that of the epoch; `along_beam` goes from -1 to 1 over a station's cameras.
     """
     at = circumstances
-    world_from_target = pose_from_vector(sight.world_from_target)
+    world_from_target = sight.world_from_target
     world_from_camera = pose_from_vector(sight.world_from_station) @ pose_from_vector(
         sight.station_from_camera
     )
@@ -192,7 +192,7 @@ def range_drivers(
     """
     finder_from_target = (
         pose_from_vector(aim.world_from_station) @ pose_from_vector(aim.station_from_rangefinder)
-    ).inverse() @ pose_from_vector(aim.world_from_target)
+    ).inverse() @ aim.world_from_target
     to_mark = finder_from_target.apply(aim.point)
     forward = jnp.array([0.0, 0.0, 1.0])
     beam = jnp.where(to_plane > 0.5, forward, to_mark / jnp.linalg.norm(to_mark))

@@ -52,7 +52,8 @@ class Ranges(eqx.Module):
         none = Circumstances(*[jnp.zeros(())] * len(Circumstances._fields))
 
         def one(vector, point, to_plane):
-            aim = Aim(vector, jnp.zeros(6), vector_from_pose(station_from_target), point)
+            own = vector_from_pose(station_from_target)
+            aim = Aim(vector, jnp.zeros(6), jnp.zeros(6), own, point)
             return predict_range(aim, none, to_plane, PortValues())
 
         return jax.vmap(one)(self.station_from_rangefinder, self.point, self.to_plane)

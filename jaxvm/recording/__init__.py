@@ -25,7 +25,15 @@ from jaxvm.recording.model import (
     Target,
 )
 from jaxvm.recording.read import read_model, read_recording
-from jaxvm.recording.recording import Drivers, Links, Observations, Ranges, Recording
+from jaxvm.recording.recording import (
+    Drivers,
+    Links,
+    Observations,
+    Ranges,
+    Recording,
+    no_observations,
+    uncorrelated,
+)
 from jaxvm.recording.write import model_text, write_recording
 
 __all__ = [
@@ -53,8 +61,10 @@ __all__ = [
     "import_opencv_calibration",
     "join",
     "model_text",
+    "no_observations",
     "open_recording",
     "read_model",
     "read_recording",
+    "uncorrelated",
     "write_recording",
 ]

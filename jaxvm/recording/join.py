@@ -96,8 +96,7 @@ def _links(first: Links | None, second: Links | None, epochs: int) -> Links | No
         from_node=[*first.from_node, *(more.from_node[k] for k in new)],
         to_node=[*first.to_node, *(more.to_node[k] for k in new)],
         pose=np.concatenate([first.pose, more.pose[new]]),
-        sigma_rad=np.concatenate([first.sigma_rad, more.sigma_rad[new]]),
-        sigma_m=np.concatenate([first.sigma_m, more.sigma_m[new]]),
+        covariance=np.concatenate([first.covariance, more.covariance[new]]),
         epoch=np.concatenate([first.epoch, more.epoch[new]]),
     )
 

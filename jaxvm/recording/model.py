@@ -67,8 +67,9 @@ class Target:
     Attributes:
         point_names: names of the marks.
         points: target coordinates of the marks (m); NaN where unknown.
-        pose: world_from_target; None: start from the data.
+        pose: in the world, or in the station that carries it; None: start from the data.
         free: subset of pose, points.
+        station: that carries it; "" for a target that stands in the world.
     """
 
     name: str
@@ -77,6 +78,7 @@ class Target:
     motion: Motion = "static"
     pose: Pose | None = None
     free: frozenset[str] = frozenset()
+    station: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,6 +158,7 @@ def model_to_toml(model: Model) -> dict[str, Any]:
     table["targets"] = {
         target.name: {
             **_marks(target),
+            **({"station": target.station} if target.station else {}),
             "motion": target.motion,
             **_held(target.pose, target.free),
         }

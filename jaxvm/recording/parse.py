@@ -76,10 +76,12 @@ def parse_model(table: dict[str, Any], text: str = "") -> Model:
     noise = root.entry("noise").only(("pixel_px", "range_m"))
     cameras = _cameras(root)
     finders = _rangefinders(root)
-    stations = _stations(root, [*(c.station for c in cameras), *(f.station for f in finders)])
     targets = tuple(_target(name, entry) for name, entry in root.entries("targets").items())
+    carriers = [body.station for body in (*cameras, *finders, *targets) if body.station]
+    stations = _stations(root, carriers)
+    # Without cameras it is a network of stations that links alone join.
     for kind, bodies in (("cameras", cameras), ("targets", targets)):
-        if not bodies:
+        if not bodies and (cameras or not stations):
             root.fail(None, f"there are no {kind}; add a table [{kind}.NAME]")
     up = root.entry("world").only(("up",)).vector("up", 3)
     if up is not None and not np.linalg.norm(up) > 0.0:
@@ -227,7 +229,7 @@ def _motion(entry: Entry, default: str | None = None) -> Motion:
 
 
 def _target(name: str, entry: Entry) -> Target:
-    entry.only(("grid", "points", "motion", "pose", "free"))
+    entry.only(("grid", "points", "station", "motion", "pose", "free"))
     names, points = _marks(entry)
     pose, free = entry.pose(), entry.free(("pose", "points"))
     if free is None:
@@ -236,7 +238,9 @@ def _target(name: str, entry: Entry) -> Target:
         free |= {"points"}
     if pose is None and "pose" not in free:
         pose = np.zeros(6)
-    return Target(name, names, points, _motion(entry), pose, free)
+    station = entry.string("station", "")
+    motion = _motion(entry, "static" if station else None)
+    return Target(name, names, points, motion, pose, free, station)
 
 
 def _marks(entry: Entry) -> tuple[tuple[str, ...], np.ndarray]:

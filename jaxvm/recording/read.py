@@ -9,9 +9,17 @@ from jaxvm.recording.check import check_recording
 from jaxvm.recording.errors import RecordingError, did_you_mean, has
 from jaxvm.recording.model import Model
 from jaxvm.recording.parse import known_link, parse_model
-from jaxvm.recording.recording import Drivers, Links, Observations, Ranges, Recording
+from jaxvm.recording.recording import (
+    Drivers,
+    Links,
+    Observations,
+    Ranges,
+    Recording,
+    no_observations,
+    uncorrelated,
+)
 from jaxvm.recording.tables import Table, read_table
-from jaxvm.recording.write import RATES
+from jaxvm.recording.write import COVARIANCES, RATES
 
 _POSE = ("turn_x", "turn_y", "turn_z", "shift_x", "shift_y", "shift_z")
 
@@ -33,14 +41,19 @@ def read_recording(folder: str | Path, model: str | Path | None = None) -> Recor
         raise RecordingError(f"{folder}: there is no such folder; give the folder of a recording")
     file = folder / "recording.toml" if model is None else Path(model)
     parsed, text = read_model(file)
-    epochs = _required(folder, "epochs")
-    ids, time, timed, velocities = _epochs(epochs, parsed)
+    if parsed.cameras:
+        ids, time, timed, velocities = _epochs(_required(folder, "epochs"), parsed)
+        observed = _required(folder, "observations")
+        observations = _observations(observed, parsed, ids)
+    else:
+        ids, time, timed, velocities = np.zeros(1, int), np.zeros(1), False, {}
+        observed, observations = None, no_observations()
     recording = Recording(
         model=parsed,
         epoch_ids=ids,
         time=time,
         velocities=velocities,
-        observations=_observations(observed := _required(folder, "observations"), parsed, ids),
+        observations=observations,
         drivers=_drivers(read_table(folder, "drivers", False), parsed, time, timed),
         ranges=_ranges(read_table(folder, "ranges", False), parsed, ids),
         links=_links(read_table(folder, "links", False), parsed, ids),
@@ -48,7 +61,13 @@ def read_recording(folder: str | Path, model: str | Path | None = None) -> Recor
     )
     names = () if recording.links is None else recording.links.name
     known_link(text, parsed, list(names))
-    check_recording(recording, observed)
+    if observed is not None:
+        check_recording(recording, observed)
+    elif recording.links is None:
+        raise RecordingError(
+            f"{folder}: there are neither cameras nor links; add [cameras.NAME] to "
+            "recording.toml, or links.csv"
+        )
     return recording
 
 
@@ -259,7 +278,9 @@ def _ranges(table: Table | None, model: Model, ids: np.ndarray) -> Ranges | None
 def _links(table: Table | None, model: Model, ids: np.ndarray) -> Links | None:
     if table is None or len(table) == 0:
         return None
-    table.needs(("link", "from", "to", *_POSE, "sigma_rad", "sigma_m"), ("epoch",))
+    full = next(iter(COVARIANCES)) in table.frame
+    spread = tuple(COVARIANCES) if full else ("sigma_rad", "sigma_m")
+    table.needs(("link", "from", "to", *_POSE, *spread), ("epoch",))
     bodies = {
         "camera": [c.name for c in model.cameras],
         "station": [s.name for s in model.stations],
@@ -281,13 +302,7 @@ def _links(table: Table | None, model: Model, ids: np.ndarray) -> Links | None:
                     f"{did_you_mean(name, bodies[kind])}",
                 )
             nodes[column].append((kind, bodies[kind].index(name)))
-    sigmas = {}
-    for column, unit in (("sigma_rad", "rad"), ("sigma_m", "m")):
-        sigmas[column] = table.numbers(column, f"a standard deviation in {unit}")
-        table.check(
-            sigmas[column] > 0.0,
-            lambda row, c=column: f"{c} is {sigmas[c][row]:g}; it must be above 0",
-        )
+    covariance = _covariances(table) if full else _of_sigmas(table)
     pose = np.stack([table.numbers(c, "a number (rad or m)") for c in _POSE], axis=1)
     turn = np.linalg.norm(pose[:, :3], axis=1)
     table.check(
@@ -302,7 +317,32 @@ def _links(table: Table | None, model: Model, ids: np.ndarray) -> Links | None:
             rows = np.flatnonzero(dated)
             part = Table(table.file, table.frame.loc[dated], table.line[dated], table.word)
             epoch[rows] = _epoch_rows(part, ids)
-    return Links(
-        tuple(table.texts("link")), nodes["from"], nodes["to"], pose,
-        sigmas["sigma_rad"], sigmas["sigma_m"], epoch,
-    )  # fmt: skip
+    return Links(tuple(table.texts("link")), nodes["from"], nodes["to"], pose, covariance, epoch)
+
+
+def _of_sigmas(table: Table) -> np.ndarray:
+    """Covariances of links that give one standard deviation of turns and one of shifts."""
+    sigmas = {}
+    for column, unit in (("sigma_rad", "rad"), ("sigma_m", "m")):
+        sigmas[column] = table.numbers(column, f"a standard deviation in {unit}")
+        table.check(
+            sigmas[column] > 0.0,
+            lambda row, c=column: f"{c} is {sigmas[c][row]:g}; it must be above 0",
+        )
+    return uncorrelated(sigmas["sigma_rad"], sigmas["sigma_m"])
+
+
+def _covariances(table: Table) -> np.ndarray:
+    """Full covariances of links."""
+    found = np.zeros((len(table), 6, 6))
+    for column, (i, j) in COVARIANCES.items():
+        found[:, i, j] = found[:, j, i] = table.numbers(column, "a (co)variance in rad and m")
+    smallest = np.linalg.eigvalsh(found)[:, 0]
+    table.check(
+        smallest > 0.0,
+        lambda row: (
+            f"the covariance is not positive definite (smallest eigenvalue {smallest[row]:.3g}); "
+            "mend it, or give sigma_rad and sigma_m in its place"
+        ),
+    )
+    return found

@@ -28,6 +28,12 @@ class Observations:
     sigma: Float[np.ndarray, " n"]
 
 
+def no_observations() -> Observations:
+    """The empty table of a network that is given by links alone."""
+    none = np.zeros(0, int)
+    return Observations(none, none, none, none, np.zeros((0, 2)), np.zeros(0))
+
+
 @dataclass(frozen=True, eq=False)
 class Drivers:
     """Logged channels, sampled at their own times (s, clock of the epochs)."""
@@ -55,7 +61,7 @@ class Links:
     Attributes:
         from_node, to_node: ("camera" | "station" | "target", place in the model).
         pose: from_from_to as turn (rad) and shift (m).
-        sigma_rad, sigma_m: standard deviations of each component of turn and shift.
+        covariance: of the twist log(measured^-1 . true), turn (rad) then shift (m), in to's axes.
         epoch: row of the recording's epochs; -1 where the link belongs to none.
     """
 
@@ -63,9 +69,21 @@ class Links:
     from_node: list[tuple[str, int]]
     to_node: list[tuple[str, int]]
     pose: Float[np.ndarray, "n 6"]
-    sigma_rad: Float[np.ndarray, " n"]
-    sigma_m: Float[np.ndarray, " n"]
+    covariance: Float[np.ndarray, "n 6 6"]
     epoch: Int[np.ndarray, " n"]
+
+    @property
+    def sigma(self) -> Float[np.ndarray, "n 6"]:
+        """Standard deviations of turn (rad) and shift (m)."""
+        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+
+
+def uncorrelated(
+    sigma_rad: Float[np.ndarray, " n"], sigma_m: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, "n 6 6"]:
+    """Covariances of links whose turns (rad) and shifts (m) are equally good in all directions."""
+    variance = np.repeat(np.stack([sigma_rad, sigma_m], axis=1) ** 2, 3, axis=1)
+    return variance[:, :, None] * np.eye(6)
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,10 +10,14 @@ import tomli_w
 
 from jaxvm.recording.files import new_folder
 from jaxvm.recording.model import Model, model_to_toml
-from jaxvm.recording.recording import Recording
+from jaxvm.recording.recording import Recording, uncorrelated
 
 RATES = ("vx", "vy", "vz", "wx", "wy", "wz")
 """Columns of a target's velocity (m/s) and angular rate (rad/s) in epochs."""
+
+
+COVARIANCES = {f"c{i + 1}{j + 1}": (i, j) for i in range(6) for j in range(i, 6)}
+"""Columns of a link's covariance: turn x, y, z (rad), then shift x, y, z (m)."""
 
 
 def write_recording(
@@ -102,7 +106,12 @@ def _links(recording: Recording) -> pd.DataFrame:
     }
     for k, column in enumerate(("turn_x", "turn_y", "turn_z", "shift_x", "shift_y", "shift_z")):
         frame[column] = links.pose[:, k]
-    frame |= {"sigma_rad": links.sigma_rad, "sigma_m": links.sigma_m}
+    sigma = links.sigma
+    alike = uncorrelated(sigma[:, 0], sigma[:, 3])
+    if np.array_equal(alike, links.covariance):
+        frame |= {"sigma_rad": sigma[:, 0], "sigma_m": sigma[:, 3]}
+    else:
+        frame |= {name: links.covariance[:, i, j] for name, (i, j) in COVARIANCES.items()}
     frame["epoch"] = ["" if e < 0 else str(recording.epoch_ids[e]) for e in links.epoch]
     return pd.DataFrame(frame)
 
