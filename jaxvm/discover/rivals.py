@@ -1,4 +1,4 @@
-"""Rivals: what the recording can't tell from the chosen hypothesis at 50:1.
+"""Rivals: what the recording can't tell from the chosen hypothesis at 20:1.
 
 With e the chosen effect as it stands in the residuals and lambda = |e|^2 its drop of chi-square, a
 hypothesis that explains the share rho^2 of e is worse by lambda (1 - rho^2): what the recording can
@@ -15,18 +15,14 @@ from jaxvm.discover.courses import Course
 from jaxvm.discover.hypotheses import Family, Hypothesis, member
 from jaxvm.discover.ranking import Ranking
 from jaxvm.discover.score import ScoreTests
-from jaxvm.discover.select import log_prior, price_of_columns, stacked
+from jaxvm.discover.select import DECIDED, log_prior, price_of_columns, stacked
 from jaxvm.physics.effects import Effect
 from jaxvm.solve.adjust import Adjustment
 
 MOST, PLACES = 8, 3
 """Names that are kept, and places of each."""
 
-_ODDS = 50.0
-"""Odds against what is left out: as the set is to hold the truth in 97 % of all cases."""
-
-_UNDECIDED = 2.0 * np.log(_ODDS)
-"""Loss of chi-square up to which a hypothesis is weighed."""
+_ODDS = 20.0
 
 
 @dataclass(frozen=True)
@@ -108,12 +104,12 @@ def rivals(
     own_price = min((price for h, _, price, _ in found if h.same(own)), default=0.0)
     prices = {_course_of(h): price for h, _, price, _ in reversed(found)}
     for hypothesis, gap, _, amplitudes in found:
-        if gap <= _UNDECIDED:
+        if gap <= DECIDED:
             columns = price_of_columns(hypothesis, len(amplitudes), full - gap, n)
             cost = columns - own_columns + prices[_course_of(hypothesis)] - own_price
             weigh(hypothesis, amplitudes, gap, -0.5 * (gap + cost))
     for hypothesis, amplitudes, behind in shown:
-        if behind <= _UNDECIDED and not hypothesis.same(own):
+        if behind <= DECIDED and not hypothesis.same(own):
             prior = log_prior(hypothesis, np.asarray(amplitudes)) - own_prior
             weigh(hypothesis, amplitudes, max(behind, 0.0), -0.5 * behind - prior)
     weigh(own, own_amplitudes, 0.0, 0.0)
@@ -172,8 +168,8 @@ def _resembling(ranking: Ranking, scene, own: Hypothesis, full: float, variance:
         for kind, places in family.by_driver_and_form().items():
             best = drops[:, places].max(axis=1)
             mine = (own.course.driver, own.course.form) == kind
-            for g, s in np.argwhere(best >= full - _UNDECIDED if not mine else np.isfinite(best)):
-                if best[g, s] < full - _UNDECIDED and family.groups[g].terms != own.group.terms:
+            for g, s in np.argwhere(best >= full - DECIDED if not mine else np.isfinite(best)):
+                if best[g, s] < full - DECIDED and family.groups[g].terms != own.group.terms:
                     continue
                 each = drops[g, places, s]
                 mean = 2.0 * np.logaddexp.reduce(0.5 * each) - 2.0 * np.log(len(places))
