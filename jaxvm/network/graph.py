@@ -104,7 +104,7 @@ def unheld_parts(graph: PoseGraph) -> list[Int[np.ndarray, " part"]]:
 
 
 def check_connected(graph: PoseGraph) -> None:
-    """Raise UnconnectedNetwork, naming the parts, where edges do not join all nodes to held ones."""
+    """Raise UnconnectedNetwork, naming the parts, where edges don't join all nodes to held ones."""
     parts = unheld_parts(graph)
     if not parts:
         return
@@ -145,7 +145,7 @@ def edge_variance(graph: PoseGraph, length_m: float | None = None) -> Float[np.n
 def spanning_tree(
     graph: PoseGraph, weight: Float[np.ndarray, " edges"] | None = None
 ) -> Int[np.ndarray, " tree"]:
-    """Edges of the tree (one for each part) with the least sum of weights, ascending (Kruskal 1956).
+    """Edges of the tree (one for each part) of the least total weight, ascending (Kruskal 1956).
 
     Args:
         weight: the cost of each edge, not negative; `edge_variance` if not given.
@@ -232,8 +232,9 @@ def chain_poses(
     quaternion = np.full((n, 4), np.nan)
     quaternion[reached] = Rotation.from_rotvec(pose[reached, :3]).as_quat()
     back = np.flatnonzero(tree.sign < 0)
-    inverse = Rotation.from_quat(quaternion[back]).inv()
-    quaternion[back], shift[back] = inverse.as_quat(), -inverse.apply(shift[back])
+    if len(back):
+        inverse = Rotation.from_quat(quaternion[back]).inv()
+        quaternion[back], shift[back] = inverse.as_quat(), -inverse.apply(shift[back])
     while len(inner):
         before = ancestor[inner]
         turn = Rotation.from_quat(quaternion[before])
@@ -278,7 +279,9 @@ def compose(
     S exp(xi) P = S P exp(Ad(P)^-1 xi), and a backward step T^-1 of T exp(xi) is
     exp(-xi) T^-1 (MATHEMATICS 1.6, condition form). A walk may use an edge twice.
     """
-    edges, signs = np.array(walk, int).reshape(-1, 2).T
+    if not walk:
+        return np.zeros(6), np.zeros((6, 6))
+    edges, signs = np.array(walk, int).T
     behind, levers = np.eye(4), np.zeros((len(edges), 4, 4))
     steps = _matrices(graph.pose[edges])
     for k in reversed(range(len(edges))):
@@ -309,12 +312,12 @@ def _inverse(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
 
 
 def _adjoint_of_inverse(poses: Float[np.ndarray, "many 4 4"]) -> Float[np.ndarray, "many 6 6"]:
-    """Ad(P)^-1 = [R^T 0; -R^T hat(t) R^T], for twists (turn, shift)."""
+    """Ad(P)^-1 = [R^T, 0; -R^T hat(t), R^T], for twists (turn, shift)."""
     back = np.swapaxes(poses[:, :3, :3], 1, 2)
     out = np.zeros((len(poses), 6, 6))
     out[:, :3, :3] = out[:, 3:, 3:] = back
-    # Column j of hat(t) is t x e_j, that is -(e_j x t).
-    out[:, 3:, :3] = back @ np.cross(np.eye(3), poses[:, None, :3, 3]).swapaxes(1, 2) @ back
+    # Column j of -hat(t) is e_j x t.
+    out[:, 3:, :3] = back @ np.cross(np.eye(3), poses[:, None, :3, 3]).swapaxes(1, 2)
     return out
 
 
@@ -365,13 +368,13 @@ class _Nearest(DijkstraVisitor):
 
 
 def _tree(graph: PoseGraph, roots, seen: _Breadth | _Nearest) -> Tree:
-    n = len(graph.names)
-    parent, edge, depth = np.full(n, -1), np.full(n, -1), np.full(n, -1)
+    parent, edge, sign, depth = np.zeros((4, len(graph.names)), int) - [[1], [1], [0], [1]]
     for node in seen.order:
         if node in seen.before:
             parent[node], edge[node] = seen.before[node]
             depth[node] = depth[parent[node]] + 1
         else:
             depth[node] = 0
-    sign = np.where(edge < 0, 0, np.where(graph.edges[edge, 0] == parent, 1, -1))
+    inner = np.flatnonzero(edge >= 0)
+    sign[inner] = np.where(graph.edges[edge[inner], 0] == parent[inner], 1, -1)
     return Tree(np.asarray(roots, int), parent, edge, sign, np.array(seen.order, int), depth)

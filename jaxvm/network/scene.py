@@ -243,8 +243,14 @@ def _relaid(network: Network, old: Layout, new: Layout) -> Network:
     def shift(slots):
         return jnp.where(slots >= old.offset("identity"), slots + moved, slots)
 
-    def slots(n):
-        return [f.slots for f in (*n.pixels, n.ranges, n.links, n.closures) if f is not None]
+    def relaid(factor):
+        return None if factor is None else replace(factor, slots=shift(factor.slots))
 
-    network = eqx.tree_at(slots, network, [shift(own) for own in slots(network)])
-    return replace(network, layout=new)
+    return replace(
+        network,
+        pixels=tuple(map(relaid, network.pixels)),
+        ranges=relaid(network.ranges),
+        links=relaid(network.links),
+        closures=relaid(network.closures),
+        layout=new,
+    )

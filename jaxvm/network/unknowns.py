@@ -170,12 +170,13 @@ def free_unknowns(scene: Scene) -> Unknowns:
         ("station", model.stations, scene.station_row, "world_from_station"),
         ("target", model.targets, scene.target_row, "carrier_from_target"),
     ]
+    seen_of = _epochs_seen(scene)
     for kind, of_kind, rows, table in bodies:
         for i, body in enumerate(of_kind):
             if "pose" not in body.free:
                 continue
             moving = body.motion == "per-epoch"
-            seen = _epochs_seen(scene, kind, i)
+            seen = seen_of[kind][i]
             for epoch in range(n_epochs) if moving else (0,):
                 if moving and not seen[epoch]:
                     continue
@@ -249,21 +250,25 @@ def _release_effects(scene: Scene, layout: Layout, release, factor, tie) -> np.n
     return slots[~busy[slots]]
 
 
-def _epochs_seen(scene: Scene, kind: str, number: int) -> np.ndarray:
-    """Epochs in which a moving body is touched by any observation."""
+def _epochs_seen(scene: Scene) -> dict[str, np.ndarray]:
+    """For stations and targets, whether any observation touches them [body, epoch]."""
     obs, model = scene.recording.observations, scene.model
-    seen = np.zeros(len(scene.recording.time), bool)
-    if kind == "target":
-        own = obs.target == number
-    else:
-        carries = np.array([c.station == model.stations[number].name for c in model.cameras])
-        bears = np.array([t.station == model.stations[number].name for t in model.targets])
-        own = carries[obs.camera] | bears[obs.target]
-    seen[obs.epoch[own]] = True
+    n_epochs, places = len(scene.recording.time), scene.station_places
+    seen = {
+        "station": np.zeros((len(model.stations) + 1, n_epochs), bool),
+        "target": np.zeros((len(model.targets), n_epochs), bool),
+        "camera": np.zeros((len(model.cameras), n_epochs), bool),
+    }
+    seen["target"][obs.target, obs.epoch] = True
+    seen["camera"][obs.camera, obs.epoch] = True
     links = scene.recording.links
     if links is not None:
+        epoch = np.maximum(links.epoch, 0)
         for nodes in (links.from_node, links.to_node):
-            for node, epoch in zip(nodes, links.epoch, strict=True):
-                if node == (kind, number):
-                    seen[max(epoch, 0)] = True
+            for (kind, number), when in zip(nodes, epoch, strict=True):
+                seen[kind][number, when] = True
+    # What a station carries touches it, too; the last row collects what the world carries.
+    for kind, bodies in (("camera", model.cameras), ("target", model.targets)):
+        carrier = np.array([places.get(body.station, -1) for body in bodies], int)
+        np.logical_or.at(seen["station"], carrier, seen[kind])
     return seen

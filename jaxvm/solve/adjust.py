@@ -13,9 +13,11 @@ from jaxvm.network.residual import Residuals, residual
 from jaxvm.network.scene import Scene
 from jaxvm.solve.compiling import compile_seconds
 from jaxvm.solve.gauge import check_gauge
+from jaxvm.solve.large import check_large_gauge, is_large, minimise_large, scaled_large
 from jaxvm.solve.optimise import METHODS, minimise
-from jaxvm.solve.problem import Normal, Problem, normal_at, scaled, scene_problem
+from jaxvm.solve.problem import Problem, normal_at, scaled, scene_problem
 from jaxvm.solve.robust import Loss
+from jaxvm.solve.sparse import Pattern, SparseFactors
 
 _SAME = 1.0
 """Sum of squared changes of whitened residuals up to which the patterns of effects are the same."""
@@ -75,13 +77,17 @@ class Adjustment:
 
     def summary(self) -> str:
         """A few lines: cost, iterations, why it stopped, where the time went."""
-        rms = pixel_rms(self.scene, self.residuals())
+        residuals = self.residuals()
+        pixels = []
+        if residuals.pixels:
+            rms = pixel_rms(self.scene, residuals)
+            pixels = [f"pixel RMS          {rms:.4f} px (weighted)"]
         return "\n".join(
             [
                 f"cost               {self.cost_before:.6g} -> {self.cost:.8g}",
                 f"variance factor    {self.variance_factor:.4g}"
                 f"  ({self.degrees_of_freedom} degrees of freedom)",
-                f"pixel RMS          {rms:.4f} px (weighted)",
+                *pixels,
                 f"steps              {self.accepted} accepted of {self.evaluations}",
                 f"stopped            {self.why}",
                 f"time               {self.seconds:.2f} s, of which compiling"
@@ -182,6 +188,8 @@ def _adjusted(
         )
     if active is not None:
         problem = eqx.tree_at(lambda p: p.active, problem, problem.active & jnp.asarray(active))
+    if is_large(problem):
+        return _adjusted_large(scene, problem, method, rtol, damping, max_steps, check)
     problem, normal = scaled(problem, normal_at(problem, jnp.zeros(problem.n)))
     if check:
         check_gauge(normal, scene.unknowns)
@@ -199,11 +207,40 @@ def _adjusted(
         x=x,
         cost_before=float(history[0]) if len(history) else float("nan"),
         cost=float(history[-1]) if len(history) else float("nan"),
-        degrees_of_freedom=degrees_of_freedom(problem, normal),
+        degrees_of_freedom=degrees_of_freedom(problem, normal.hessian.diagonal()),
         evaluations=int(last.evaluations),
         accepted=int(last.accepted),
         history=history,
         why=why,
+        seconds=0.0,
+        seconds_compiling=0.0,
+    )
+
+
+def _adjusted_large(
+    scene: Scene, problem: Problem, method, rtol, damping, max_steps, check
+) -> Adjustment:
+    """The adjustment of a large network, by sparse factors on the host."""
+    pattern = Pattern.of(problem)
+    factors = SparseFactors(pattern)
+    problem, normal = scaled_large(problem, pattern)
+    if check:
+        check_large_gauge(problem, normal, factors, scene.unknowns)
+    fit = minimise_large(
+        problem, normal, factors, method, rtol=rtol, limit=max_steps, damping=damping
+    )
+    x = jnp.asarray(fit.x)
+    return Adjustment(
+        scene=scene.with_state(_state(problem, x)),
+        problem=problem,
+        x=x,
+        cost_before=float(fit.history[0]),
+        cost=float(fit.history[-1]),
+        degrees_of_freedom=degrees_of_freedom(problem, normal.diagonal()),
+        evaluations=fit.evaluations,
+        accepted=fit.accepted,
+        history=fit.history,
+        why=fit.why,
         seconds=0.0,
         seconds_compiling=0.0,
     )
@@ -217,12 +254,15 @@ def with_weights(problem: Problem, weights: tuple[np.ndarray, ...]) -> Problem:
     return eqx.tree_at(lambda p: [f.weight for f in p.network.pixels], problem, padded)
 
 
-def degrees_of_freedom(problem: Problem, normal: Normal) -> int:
-    """Weighted-in observations minus unknowns that any of them touches."""
+def degrees_of_freedom(problem: Problem, diagonal) -> int:
+    """Weighted-in observations minus unknowns that any of them touches.
+
+    `diagonal` is that of the normal matrix.
+    """
     used = sum(
         int(np.sum(np.asarray(f.weight) > 0)) * f.sigma.shape[1] for f in problem.network.factors()
     )
-    return used - int(np.sum(np.asarray(normal.hessian.diagonal()) > 0))
+    return used - int(np.sum(np.asarray(diagonal) > 0))
 
 
 @eqx.filter_jit

@@ -16,8 +16,11 @@ from jaxtyping import Array, Float
 from jaxvm.network.state import State
 from jaxvm.solve.adjust import Adjustment
 from jaxvm.solve.arrow import ArrowFactors, factorise
+from jaxvm.solve.large import is_large
 from jaxvm.solve.problem import Problem, normal_at
+from jaxvm.solve.selected import SelectedInverse
 from jaxvm.solve.snooping import robust_variance
+from jaxvm.solve.sparse import Pattern, SparseFactors, sparse_normal
 
 
 def covariance(
@@ -30,21 +33,36 @@ def covariance(
     `quantity` must be differentiable; it may combine any fields of the state, such as the pose of
     one target relative to another.
     """
-    return scale * _covariance(adjustment.problem, adjustment.x, _factors(adjustment), quantity)
+    rows = _derivative(adjustment.problem, adjustment.x, quantity)
+    return scale * rows @ _solve(_factors(adjustment), rows.T)
 
 
-def _factors(adjustment: Adjustment) -> ArrowFactors:
+def _factors(adjustment: Adjustment) -> ArrowFactors | SparseFactors:
     """The factorised normal matrix at the solution."""
+    if is_large(adjustment.problem):
+        factors = SparseFactors(Pattern.of(adjustment.problem))
+        factors.factorise(sparse_normal(adjustment.problem, factors.pattern, adjustment.x))
+        return factors
     return _factorised(normal_at(adjustment.problem, adjustment.x).hessian)
 
 
 _factorised = eqx.filter_jit(factorise)
 
 
+def _solve(factors: ArrowFactors | SparseFactors, right):
+    if isinstance(factors, SparseFactors):
+        return factors.solve(np.asarray(right))
+    return _solved(factors, right)
+
+
 @eqx.filter_jit
-def _covariance(problem: Problem, x, factors: ArrowFactors, quantity):
-    rows = jax.jacrev(lambda y: jnp.ravel(quantity(problem.state(y))))(x)
-    return rows @ factors.solve(rows.T)
+def _solved(factors: ArrowFactors, right):
+    return factors.solve(right)
+
+
+@eqx.filter_jit
+def _derivative(problem: Problem, x, quantity):
+    return jax.jacrev(lambda y: jnp.ravel(quantity(problem.state(y))))(x)
 
 
 def wald_drops(adjustment: Adjustment, groups: list[np.ndarray]) -> list[float]:
@@ -67,23 +85,50 @@ def amplitude_covariance(
     problem = adjustment.problem
     positions = problem.network.layout.all("amplitude")
     columns = np.asarray(problem.column)[positions]
-    inverse = np.asarray(_inverse_columns(_factors(adjustment), jnp.asarray(columns)))[columns]
+    units = np.zeros((problem.n, len(columns)))
+    units[columns, np.arange(len(columns))] = 1.0
+    inverse = np.asarray(_solve(_factors(adjustment), jnp.asarray(units)))[columns]
     factor = np.asarray(problem.factor)[positions]
     spread = factor[:, None] * inverse * factor
     return spread if chosen is None else spread[np.ix_(chosen, chosen)]
 
 
-@eqx.filter_jit
-def _inverse_columns(factors: ArrowFactors, columns):
-    count = columns.shape[0]
-    return factors.solve(
-        jnp.zeros((factors.arrow.in_size(), count)).at[columns, jnp.arange(count)].set(1.0)
-    )
+def pose_covariances(
+    adjustment: Adjustment, table: str = "world_from_station", scale: float = 1.0
+) -> Float[np.ndarray, "rows 6 6"]:
+    """Covariance of every pose of a table of the state: turn (rad), then shift (m).
+
+    Zero where it is held. The turn is that of the pose's rotation vector.
+    """
+    problem = adjustment.problem
+    layout = problem.network.layout
+    positions = layout.slots(table, np.arange(layout.shapes[table][0]))
+    columns, factor = np.asarray(problem.column)[positions], np.asarray(problem.factor)[positions]
+    if is_large(problem):
+        inverse = SelectedInverse.of(adjustment.problem, adjustment.x).blocks(columns)
+    else:
+        inverse = np.zeros((*columns.shape, 6))
+        factors = _factors(adjustment)
+        for row, own in enumerate(columns):
+            live = np.flatnonzero(own < problem.n)
+            units = np.zeros((problem.n, 6))
+            units[own[live], live] = 1.0
+            solved = np.asarray(_solve(factors, jnp.asarray(units)))
+            inverse[row][np.ix_(live, live)] = solved[own[live]][:, live]
+    return scale * factor[:, :, None] * inverse * factor[:, None, :]
 
 
 def standard_deviations(adjustment: Adjustment, scale: float = 1.0) -> State:
     """Standard deviation of every parameter of the state; zero where it is held."""
-    flat = _marginals(adjustment.problem, _factors(adjustment))
+    problem = adjustment.problem
+    if is_large(problem):
+        variance = SelectedInverse.of(problem, adjustment.x).diagonal()
+        variance = np.append(np.where(np.asarray(problem.active), variance, 0.0), 0.0)
+        flat = jnp.abs(problem.factor) * jnp.sqrt(variance[np.asarray(problem.column)])
+    else:
+        factors = _factors(adjustment)
+        assert isinstance(factors, ArrowFactors)
+        flat = _marginals(problem, factors)
     return adjustment.problem.network.layout.restore(jnp.sqrt(scale) * flat)
 
 

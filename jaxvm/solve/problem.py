@@ -119,7 +119,7 @@ class Problem(eqx.Module):
 
     def flat(self, x: Float[Array, " n"]) -> Float[Array, " parameters"]:
         """Flat state at x."""
-        return _flat(self.base, self.factor, self.column, self.active, x)[0]
+        return flat_state(self, x)[0]
 
     def state(self, x: Float[Array, " n"]) -> State:
         """State at x."""
@@ -141,7 +141,7 @@ class Problem(eqx.Module):
         With `tangent` also by every port, where ports act on the table.
         """
         raw, whiten, steps = [], [], []
-        flat, per_parameter = _flat(self.base, self.factor, self.column, self.active, x)
+        flat, per_parameter = flat_state(self, x)
         network, layout = self.network, self.network.layout
         constant = flat[layout.offset("constant") : layout.offset("identity")]
         values = courses(network.effects, constant, network.channels)
@@ -151,7 +151,7 @@ class Problem(eqx.Module):
             raw.append(linearise(factor, network, flat, values, slopes, packets.live, tangent))
             whiten.append((factor.weight, factor.sigma))
             steps.append((factor.slots, jnp.asarray(effects), packets.live))
-        return _whitened(raw, whiten, steps, per_parameter)
+        return whitened(raw, whiten, steps, per_parameter)
 
     def normal(self, x: Float[Array, " n"]) -> Normal:
         """Cost, gradient and Gauss-Newton matrix, with the weights of the robust loss."""
@@ -163,16 +163,28 @@ class Problem(eqx.Module):
         return _assembled(tables, self.packets, own, self.loss, self.sizes)
 
 
+def flat_state(problem: Problem, x: Float[Array, " n"]) -> tuple[Array, Array]:
+    """Flat state at x, and the change of every parameter for a unit change of its unknown."""
+    return _flat(problem.base, problem.factor, problem.column, problem.active, x)
+
+
 @jax.jit
 def _flat(base, factor, column, active, x):
-    """Flat state at x, and the change of every parameter for a unit change of its unknown."""
     moved = jnp.concatenate([jnp.where(active, x, 0.0), jnp.zeros(1)])
     moving = jnp.concatenate([active, jnp.zeros(1, bool)])[column]
     return base + factor * moved[column], jnp.where(moving, factor, 0.0)
 
 
 @eqx.filter_jit
-def _whitened(raw: list[Linearised], whiten, steps, per_parameter) -> list[Linearised]:
+def whitened(raw: list[Linearised], whiten, steps, per_parameter) -> list[Linearised]:
+    """Tables in units of their standard deviations, with derivatives by unknowns.
+
+    Args:
+        raw: in their own units.
+        whiten: weight and sigma of each table.
+        steps: slots, positions of all effects, and live positions of each table.
+        per_parameter: change of every parameter for a unit change of its unknown.
+    """
     result = []
     for table, (weight, sigma), (slots, effects, live) in zip(raw, whiten, steps, strict=True):
         # What is set aside counts nothing, even where it can't be predicted at all.

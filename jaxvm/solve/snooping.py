@@ -14,8 +14,10 @@ from scipy.stats import chi2
 from jaxvm.network.scene import Scene
 from jaxvm.solve.adjust import Adjustment, adjust
 from jaxvm.solve.arrow import factorise
+from jaxvm.solve.large import is_large
 from jaxvm.solve.problem import Problem
-from jaxvm.solve.reduced import half_rows
+from jaxvm.solve.reduced import half_rows, packet_of_rows
+from jaxvm.solve.selected import SelectedInverse
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,8 @@ def _redundancies(problem: Problem, x):
     tables = problem.linearised(x)
     jacobians = [table.jacobian for table in tables]
     counted = [factor.weight > 0.0 for factor in problem.network.factors()]
+    if is_large(problem):
+        return _large_complements(problem, x, jacobians, counted)
     hessian = problem.assembled(tables).hessian
     return _complements(hessian, problem.packets, jacobians, counted, problem.sizes)
 
@@ -53,6 +57,19 @@ def _complements(hessian, packets_of, jacobians, counted, sizes):
         half = half_rows(factors, packets, jacobian, sizes)
         hat = jnp.einsum("nak,nbk->nab", half, half)
         result.append(used[:, None, None] * jnp.eye(hat.shape[1]) - hat)
+    return result
+
+
+def _large_complements(problem: Problem, x, jacobians, counted) -> list[np.ndarray]:
+    """The same through the selected inverse: an observation needs its own unknowns' block only."""
+    inverse = SelectedInverse.of(problem, x)
+    result = []
+    for packets, jacobian, used in zip(problem.packets, jacobians, counted, strict=True):
+        blocks = inverse.blocks(np.asarray(packets.columns))
+        jacobian = np.asarray(jacobian)
+        packet = np.asarray(packet_of_rows(packets, len(jacobian)))
+        hat = np.einsum("nak,nkl,nbl->nab", jacobian, blocks[packet], jacobian, optimize=True)
+        result.append(np.asarray(used)[:, None, None] * np.eye(hat.shape[1]) - hat)
     return result
 
 

@@ -1,0 +1,161 @@
+"""Gauss-Newton and Levenberg-Marquardt for large networks: a loop on the host about CHOLMOD.
+
+The rules are those of `jaxvm.solve.optimise`: relative damping of a unit diagonal, a trust region
+that opens fast, and a statistical stop.
+"""
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxvm.network.unknowns import Unknowns
+from jaxvm.solve.gauge import NullDirection, RankDeficiency
+from jaxvm.solve.problem import Problem
+from jaxvm.solve.sparse import Pattern, SparseFactors, SparseNormal, sparse_normal
+
+_MOST_DAMPING, _LEAST_DAMPING = 1e12, 1e-12
+_UNSEEN = 1e-20
+"""Sum of squared residual changes by a unit vector of scaled unknowns that shows nothing at all.
+
+Rounding leaves 1e-30. The eigenvalues of a long chain fall with the fourth power of its length, so
+those of the matrix, which rounding touches at 1e-16, can't tell a weak network from a broken one."""
+
+
+_DENSE = 1500
+"""Shared unknowns beyond which the dense arrow is slower than sparse factors, and soon too large."""
+
+
+def is_large(problem: Problem) -> bool:
+    """Whether a problem is solved by sparse factors on the host."""
+    s, groups, d = problem.sizes
+    return s > _DENSE or s * groups * d > 50_000_000
+
+
+@dataclass(frozen=True)
+class LargeFit:
+    """Solution of a large problem, and how it was reached."""
+
+    x: Float[np.ndarray, " n"]
+    history: Float[np.ndarray, " evaluations"]  # cost at the best point after each evaluation
+    evaluations: int
+    accepted: int
+    why: str
+
+
+def scaled_large(problem: Problem, pattern: Pattern) -> tuple[Problem, SparseNormal]:
+    """The problem with unknowns scaled to a unit diagonal, and its normal equations at x = 0."""
+    normal = sparse_normal(problem, pattern, jnp.zeros(problem.n))
+    diagonal = normal.diagonal()
+    scale = np.where(diagonal > 0.0, 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0)), 1.0)
+    per_parameter = np.append(scale, 1.0)[np.asarray(problem.column)]
+    problem = eqx.tree_at(lambda p: p.factor, problem, problem.factor * per_parameter)
+    return problem, normal.rescaled(scale)
+
+
+def minimise_large(
+    problem: Problem,
+    normal: SparseNormal,
+    factors: SparseFactors,
+    method: str,
+    rtol: float = 1e-12,
+    atol: float = 1e-9,
+    limit: int = 100,
+    damping: float = 1e-4,
+) -> LargeFit:
+    """Minimise a scaled problem from x = 0, given its normal equations there.
+
+    It stops when a hardly damped step is foretold to change the cost by no more than `rtol` of
+    itself plus `atol`, or when damping can't find a lower cost any more.
+
+    Args:
+        problem: with unknowns scaled to a unit diagonal.
+        normal: at x = 0.
+        factors: for the pattern of `normal`.
+        method: "gauss-newton" takes full steps; "levenberg-marquardt" damps them.
+        rtol, atol: of the cost.
+        limit: bound on evaluations.
+        damping: the first one of Levenberg-Marquardt.
+    """
+    x, history, accepted = np.zeros(problem.n), [normal.cost], 0
+    refused = 0
+    careful = method == "levenberg-marquardt"
+    damping = damping if careful else 0.0
+    why = f"stopped after {limit} evaluations: not converged"
+    while len(history) < limit:
+        if not factors.factorise(normal, damping):
+            if not careful or damping > _MOST_DAMPING:
+                why = "failed: the normal equations are singular"
+                break
+            damping = max(10.0 * damping, _LEAST_DAMPING)
+            continue
+        step = -factors.solve(normal.gradient)
+        foretold = -float(normal.gradient @ step) - 0.5 * float(step @ normal.mv(step))
+        trial = sparse_normal(problem, normal.pattern, jnp.asarray(x + step))
+        gained = normal.cost - trial.cost
+        better = np.isfinite(trial.cost) and (not careful or gained > 1e-4 * foretold)
+        settled = abs(gained) <= rtol * normal.cost + atol
+        if better:
+            x, normal, accepted = x + step, trial, accepted + 1
+        history.append(normal.cost)
+        if settled and damping <= 1.0:
+            why = "converged: the cost no longer changes"
+            break
+        if not better and (not careful or damping > _MOST_DAMPING):
+            why = "failed: no step lowers the cost"
+            break
+        if careful:
+            ratio = gained / foretold if foretold > 0.0 else -1.0
+            refused = 0 if better else refused + 1
+            damping = _changed(damping, ratio, refused)
+    return LargeFit(x, np.array(history), len(history), accepted, why)
+
+
+def _changed(damping: float, ratio: float, refused: int) -> float:
+    """Much less after a step that went as foretold; ever more after bad ones in a row.
+
+    The weak modes of a large network need a damping near nothing, and every step counts.
+    """
+    if refused:
+        return 10.0**refused * damping
+    return max(damping * (1e-3 if ratio > 0.75 else 0.1 if ratio > 0.25 else 1.0), _LEAST_DAMPING)
+
+
+def check_large_gauge(
+    problem: Problem, normal: SparseNormal, factors: SparseFactors, unknowns: Unknowns
+) -> None:
+    """Raise RankDeficiency, naming the unknowns, where a scaled problem is singular.
+
+    The least eigenvector comes from inverse iteration; whether any observation sees it, from the
+    residual's own derivative along it.
+    """
+    shift = 0.0 if factors.factorise(normal) else 1e-12
+    if shift and not factors.factorise(normal, shift):
+        raise RankDeficiency("the normal equations are not finite; mend the start values")
+    used = normal.diagonal() > 0.0
+    vector = np.where(used, np.random.default_rng(0).standard_normal(normal.pattern.n), 0.0)
+    for _ in range(4):
+        vector = np.where(used, factors.solve(vector), 0.0)
+        vector /= np.linalg.norm(vector)
+    eigenvalue = float(_seen(problem, jnp.asarray(vector)))
+    if eigenvalue > _UNSEEN:
+        return
+    share = np.abs(vector)
+    names = unknowns.names()
+    order = np.argsort(-share)[:60]
+    kept = [(names[i], float(share[i])) for i in order if share[i] > 0.1 * share.max() and names[i]]
+    direction = NullDirection(eigenvalue, tuple(kept))
+    raise RankDeficiency(
+        f"the observations do not determine: {direction.words()}; "
+        "hold one of them, add a prior, or record what ties them down"
+    )
+
+
+@eqx.filter_jit
+def _seen(problem: Problem, direction):
+    """Sum of squared changes of the whitened residuals along a direction of the unknowns."""
+    _, change = jax.jvp(problem.residual, (jnp.zeros(problem.n),), (direction,))
+    return sum(jnp.sum(block**2) for block in jax.tree.leaves(change))

@@ -1,0 +1,190 @@
+"""Normal equations of large networks: sparse, factorised on the host by CHOLMOD.
+
+The arrow form (`jaxvm.solve.arrow`) keeps its shared part dense. A network of thousands of stations
+shares everything with everything along its sight lines, and little else: here all unknowns go into
+one sparse matrix, whose elimination order (approximate minimum degree, Amestoy, Davis & Duff 1996)
+finds local unknowns by itself. Packets are linearised and multiplied in one compiled program that
+keeps no Jacobian; only their small blocks reach the host.
+"""
+
+from dataclasses import dataclass, replace
+
+import cvxopt
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from cvxopt import cholmod
+from jaxtyping import Array, Float, Int
+
+from jaxvm.network.residual import linearise
+from jaxvm.physics.effects import course_slopes, courses
+from jaxvm.solve.problem import Packets, Problem, flat_state, whitened
+
+_ROWS_AT_A_TIME = 2048
+"""Rows that are linearised together: their Jacobian stays in the processor's cache."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pattern:
+    """Where the non-zeros of a normal matrix are, and which products of packets add up to each.
+
+    Lower triangle by columns, rows ascending. The diagonal is complete.
+
+    Attributes:
+        n: number of unknowns.
+        row, column: of each non-zero.
+        diagonal: place of each diagonal entry among the non-zeros.
+        source, place: for each table, which entries of its flattened blocks count, and where.
+        unknown: for each table, the unknown of each gradient entry of its packets.
+    """
+
+    n: int
+    row: Int[np.ndarray, " nonzeros"]
+    column: Int[np.ndarray, " nonzeros"]
+    diagonal: Int[np.ndarray, " n"]
+    source: tuple[Int[np.ndarray, " entries"], ...]
+    place: tuple[Int[np.ndarray, " entries"], ...]
+    unknown: tuple[Int[np.ndarray, " entries"], ...]
+
+    @classmethod
+    def of(cls, problem: Problem) -> "Pattern":
+        """Pattern of a problem's normal equations."""
+        n = problem.n
+        sources, keys = [], []
+        for packets in problem.packets:
+            columns = np.asarray(packets.columns)
+            k = columns.shape[1]
+            rows = np.repeat(columns, k, axis=1).ravel()
+            below = np.tile(columns, (1, k)).ravel()
+            source = np.flatnonzero((rows >= below) & (rows < n))
+            sources.append(source)
+            keys.append(below[source] * n + rows[source])
+        diagonal = np.arange(n) * (n + 1)
+        every, place = np.unique(np.concatenate([*keys, diagonal]), return_inverse=True)
+        ends = np.cumsum([len(key) for key in keys]).astype(int)
+        pieces = np.split(place, ends)
+        return cls(
+            n=n,
+            row=every % n,
+            column=every // n,
+            diagonal=pieces[-1],
+            source=tuple(sources),
+            place=tuple(pieces[:-1]),
+            unknown=tuple(np.asarray(packets.columns).ravel() for packets in problem.packets),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class SparseNormal:
+    """Cost, gradient and Gauss-Newton matrix (the values of its pattern) at one x."""
+
+    pattern: Pattern
+    cost: float
+    gradient: Float[np.ndarray, " n"]
+    values: Float[np.ndarray, " nonzeros"]
+
+    def diagonal(self) -> Float[np.ndarray, " n"]:
+        """Diagonal of the matrix."""
+        return self.values[self.pattern.diagonal]
+
+    def rescaled(self, scale: Float[np.ndarray, " n"]) -> "SparseNormal":
+        """The same for unknowns in other units: x_new = x / scale."""
+        both = scale[self.pattern.row] * scale[self.pattern.column]
+        return replace(self, gradient=self.gradient * scale, values=self.values * both)
+
+    def mv(self, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Matrix times vector."""
+        row, column, n = self.pattern.row, self.pattern.column, self.pattern.n
+        off = row != column
+        lower = np.bincount(row, self.values * x[column], n)
+        return lower + np.bincount(column[off], self.values[off] * x[row[off]], n)
+
+
+def sparse_normal(problem: Problem, pattern: Pattern, x: Float[Array, " n"]) -> SparseNormal:
+    """Normal equations of a problem at x, with the weights of its robust loss."""
+    cost, blocks, products = _products(problem, jnp.asarray(x))
+    values = np.zeros(len(pattern.row))
+    gradient = np.zeros(pattern.n + 1)
+    tables = zip(pattern.source, pattern.place, pattern.unknown, blocks, products, strict=True)
+    for source, place, unknown, block, product in tables:
+        values += np.bincount(place, np.ravel(block)[source], len(values))
+        gradient += np.bincount(unknown, np.ravel(product), len(gradient))
+    return SparseNormal(pattern, float(cost), gradient[:-1], values)
+
+
+@eqx.filter_jit
+def _products(problem: Problem, x):
+    """Cost, and J^T J and J^T r of every packet of every table."""
+    network, layout = problem.network, problem.network.layout
+    flat, per_parameter = flat_state(problem, x)
+    constant = flat[layout.offset("constant") : layout.offset("identity")]
+    values = courses(network.effects, constant, network.channels)
+    slopes = course_slopes(network.effects, constant, network.channels)
+    effects = jnp.asarray(np.concatenate([layout.all("amplitude"), layout.all("constant")]))
+
+    def of_packet(rows, factor, packets: Packets):
+        n = factor.slots.shape[0]
+        own = jax.tree.map(
+            lambda leaf: leaf[jnp.minimum(rows, n - 1)] if leaf.ndim else leaf, factor
+        )
+        weight = jnp.where(rows < n, own.weight, 0.0)
+        raw = linearise(own, network, flat, values, slopes, packets.live)
+        (table,) = whitened(
+            [raw], [(weight, own.sigma)], [(own.slots, effects, packets.live)], per_parameter
+        )
+        square = jnp.sum(table.value**2, axis=1)
+        root = jnp.sqrt(problem.loss.weight(square))[:, None]
+        left = jnp.reshape(table.jacobian * root[:, :, None], (-1, len(packets.live)))
+        cost = 0.5 * jnp.sum(problem.loss.value(square))
+        return cost, left.T @ left, left.T @ jnp.ravel(table.value * root)
+
+    cost, blocks, products = jnp.zeros(()), [], []
+    for factor, packets in zip(network.factors(), problem.packets, strict=True):
+        width = packets.rows.shape[1]
+        found = jax.lax.map(
+            lambda rows, f=factor, p=packets: of_packet(rows, f, p),
+            packets.rows,
+            batch_size=max(_ROWS_AT_A_TIME // width, 1),
+        )
+        cost = cost + jnp.sum(found[0])
+        blocks.append(found[1])
+        products.append(found[2])
+    return cost, blocks, products
+
+
+class SparseFactors:
+    """Cholesky factors of sparse normal matrices of one pattern: analysed once.
+
+    Unknowns that no observation touches (zero diagonal) stay where they are.
+    """
+
+    def __init__(self, pattern: Pattern):
+        self.pattern = pattern
+        self._matrix = cvxopt.spmatrix(
+            1.0,
+            cvxopt.matrix(pattern.row),
+            cvxopt.matrix(pattern.column),
+            (pattern.n, pattern.n),
+        )
+        self._symbolic = cholmod.symbolic(self._matrix)
+
+    def factorise(self, normal: SparseNormal, damping: float = 0.0) -> bool:
+        """Factorise the matrix plus `damping` on its diagonal; False where it is not definite."""
+        values = normal.values.copy()
+        diagonal = values[self.pattern.diagonal]
+        values[self.pattern.diagonal] = np.where(diagonal > 0.0, diagonal + damping, 1.0)
+        if not np.isfinite(values).all():
+            return False
+        self._matrix.V = cvxopt.matrix(values)
+        try:
+            cholmod.numeric(self._matrix, self._symbolic)
+        except ArithmeticError:
+            return False
+        return True
+
+    def solve(self, right: Float[np.ndarray, "n *k"]) -> Float[np.ndarray, "n *k"]:
+        """Solution for one right-hand side or a block of them, with the latest factors."""
+        columns = cvxopt.matrix(np.reshape(right, (self.pattern.n, -1)))
+        cholmod.solve(self._symbolic, columns)
+        return np.reshape(np.array(columns), np.shape(right))
