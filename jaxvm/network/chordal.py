@@ -2,14 +2,14 @@
 
 Rotations are found as plain 3 x 3 matrices by linear least squares and projected to the nearest
 rotations, shifts by linear least squares with these rotations (Martinec & Pajdla 2007; Carlone,
-Tron, Daniilidis & Dellaert 2015, section III-C). Without noise the result is exact; with noise it is
-near enough to the optimum for Gauss-Newton where a start by dead reckoning is not.
+Tron, Daniilidis & Dellaert 2015, section III-C). Without noise the result is exact; with noise it
+is near enough to the optimum for Gauss-Newton where a start by dead reckoning is not.
 """
 
 import cvxopt
 import numpy as np
 import scipy.sparse as sp
-from cvxopt import cholmod
+from cvxopt import cholmod  # pyright: ignore[reportAttributeAccessIssue]
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
@@ -27,19 +27,19 @@ def chordal_poses(
         rounds: repetitions with edges weighted down by how badly they fit (weights of the Cauchy
             distribution), against gross errors.
     """
-    n, edges = len(graph.names), graph.edges
+    n = len(graph.names)
     turn = Rotation.from_rotvec(graph.pose[:, :3]).as_matrix()
     variance = np.diagonal(graph.covariance, axis1=1, axis2=2)
     about = 1.0 / variance[:, :3].mean(axis=1)
     along = 1.0 / variance[:, 3:].mean(axis=1)
     known = np.zeros((n, 6))
     known[graph.held] = held
-    factor = np.ones(len(edges))
-    for k in range(rounds + 1):
+    rotation = _rotations(graph, turn, about, known)
+    shift = _shifts(graph, rotation, along, known)
+    for _ in range(rounds):
+        factor = _fit(graph, turn, rotation, shift, about, along)
         rotation = _rotations(graph, turn, about * factor, known)
         shift = _shifts(graph, rotation, along * factor, known)
-        if k < rounds:
-            factor = _fit(graph, turn, rotation, shift, about, along)
     return np.concatenate([Rotation.from_matrix(rotation).as_rotvec(), shift], axis=1)
 
 

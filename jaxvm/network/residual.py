@@ -179,9 +179,10 @@ def linearise(
 ) -> Linearised:
     """Each row with its derivatives: by its live slots, and by the ports.
 
-    `live` are the positions along [own slots, amplitudes, constants] that are wanted. Whatever the number of effects, they enter
-    through the ports: one derivative by the ports serves all amplitudes and constants. Without any
-    the tangent is computed when it is asked for, else it is empty.
+    `live` are the positions along [own slots, amplitudes, constants] that are wanted. Whatever the
+    number of effects, they enter through the ports: one derivative by the ports serves all
+    amplitudes and constants. Without any the tangent is computed when it is asked for, else it is
+    empty.
     """
     layout, n_own = network.layout, factor.slots.shape[1]
     acting = _acting(network, flat, values)

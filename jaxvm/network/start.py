@@ -6,23 +6,49 @@ the views: each tells camera_from_target, and a pose that three known neighbours
 
 from collections import defaultdict
 from dataclasses import replace
+from typing import Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxvm.geometry.lenses import lens_family
+from jaxvm.network.chordal import chordal_poses
+from jaxvm.network.graph import check_connected
+from jaxvm.network.relations import (
+    Key,
+    Relation,
+    held_poses,
+    link_relations,
+    matrix,
+    name_of,
+    pose_graph,
+    vector,
+    view_relations,
+)
+from jaxvm.network.residual import residual
 from jaxvm.network.scene import Scene
-from jaxvm.network.views import View, collect_views, guess_intrinsics, pose_of_view, rays_of_pixels
+from jaxvm.network.views import View, collect_views, guess_intrinsics, rays_of_pixels
 
 
 class StartError(ValueError):
     """The data don't give start values; the message says for what and why."""
 
 
-def start(scene: Scene) -> Scene:
+Start = Literal["given", "chordal", "best"]
+
+
+def start(scene: Scene, poses: Start = "given") -> Scene:
     """The scene at start values computed from its data.
+
+    Args:
+        scene: as built.
+        poses: "given" keeps the poses that the model gives and finds the others along chains of
+            views and links; "chordal" finds all free poses from all views and links together
+            (`jaxvm.network.chordal`), whatever the model gives; "best" tries both, and the latter
+            with and without weights against gross errors, and keeps what fits best.
 
     Raises:
         StartError: a camera without known intrinsics sees no target well enough, or a body can't
@@ -30,10 +56,41 @@ def start(scene: Scene) -> Scene:
     """
     views = collect_views(scene.recording)
     scene = _start_intrinsics(scene, views)
-    relations = _view_relations(scene, views) + _link_relations(scene)
-    known = _chain(scene, relations)
-    scene = _with_poses(scene, known)
-    return _triangulated(scene)
+    relations = view_relations(scene, views) + link_relations(scene)
+    if poses == "given":
+        return _placed(scene, _chain(scene, relations, held_poses(scene)))
+    rounds = (0,) if poses == "chordal" else (0, _ROUNDS)
+    found = [
+        _placed(scene, _chain(scene, relations, _chordal(scene, relations, n))) for n in rounds
+    ]
+    if poses == "best":
+        found.append(_placed(scene, _chain(scene, relations, held_poses(scene))))
+        found.sort(key=_misfit)
+    return found[0]
+
+
+def _placed(scene: Scene, known: dict[Key, np.ndarray]) -> Scene:
+    return _triangulated(_with_poses(scene, known))
+
+
+_ROUNDS = 10
+"""Repetitions of a chordal start with weights against gross errors."""
+
+
+def _chordal(scene: Scene, relations: list[Relation], rounds: int) -> dict[Key, np.ndarray]:
+    """Held poses, and those that relations give all together."""
+    known = _with_origin(scene, relations, held_poses(scene, given=False))
+    graph, keys = pose_graph(scene, relations, known)
+    check_connected(graph)
+    found = chordal_poses(graph, np.zeros((1, 6)), rounds)
+    return known | {key: matrix(pose) for key, pose in zip(keys[1:], found[1:], strict=True)}
+
+
+def _misfit(scene: Scene) -> float:
+    """Sum of squared whitened residuals in which gross errors count little (Cauchy)."""
+    blocks = jax.tree.leaves(residual(scene.state, scene.network))
+    total = sum(float(jnp.sum(jnp.log1p(jnp.sum(block**2, axis=1) / 9.0))) for block in blocks)
+    return total if np.isfinite(total) else np.inf
 
 
 def _start_intrinsics(scene: Scene, views: list[View]) -> Scene:
@@ -62,109 +119,20 @@ def _start_intrinsics(scene: Scene, views: list[View]) -> Scene:
     return replace(scene, state=state)
 
 
-# A pose is a pair (rotation matrix, shift); a node's pose in the world is a product of up to two.
-# Keys of unknown poses: ("camera", i), ("station", row), ("target", row).
-
-
-def _matrix(vector) -> np.ndarray:
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_rotvec(np.array(vector[:3])).as_matrix()
-    pose[:3, 3] = vector[3:]
-    return pose
-
-
-def _vector(pose: np.ndarray) -> np.ndarray:
-    return np.concatenate([Rotation.from_matrix(pose[:3, :3]).as_rotvec(), pose[:3, 3]])
-
-
-def _view_relations(scene: Scene, views: list[View]):
-    """Relations (chain of keys a, chain of keys b, a_from_b, error) of all views."""
-    relations = []
-    focal, centre = np.asarray(scene.state.focal), np.asarray(scene.state.centre)
-    distortion = np.asarray(scene.state.distortion)
-    families = [lens_family(camera.lens) for camera in scene.model.cameras]
-    rays: dict[int, np.ndarray] = {}
-    for camera, family in enumerate(families):
-        own = [v.pixels for v in views if v.camera == camera]
-        if own:
-            rays[camera] = rays_of_pixels(
-                family, focal[camera], centre[camera], distortion[camera], np.concatenate(own)
-            )
-    taken: dict[int, int] = defaultdict(int)
-    for view in views:
-        first = taken[view.camera]
-        taken[view.camera] += len(view.pixels)
-        of_view = rays[view.camera][first : taken[view.camera]]
-        sound = np.isfinite(of_view).all(axis=1)
-        if sound.sum() < 4:
-            continue
-        found = pose_of_view(view.points[sound], of_view[sound])
-        if found is None:
-            continue
-        a = _keys(scene, "camera", view.camera, view.epoch)
-        b = _keys(scene, "target", view.target, view.epoch)
-        relations.append((a, b, _matrix(found[0]), found[1] / np.sqrt(len(of_view))))
-    return relations
-
-
-def _link_relations(scene: Scene):
-    links = scene.recording.links
-    if links is None:
-        return []
-    sigma = links.sigma[:, :3].max(axis=1)
-    epoch = np.maximum(links.epoch, 0)
-    return [
-        (
-            _keys(scene, *links.from_node[i], epoch[i]),
-            _keys(scene, *links.to_node[i], epoch[i]),
-            _matrix(links.pose[i]),
-            float(sigma[i]),
-        )
-        for i in range(len(links.name))
-    ]
-
-
-def _keys(scene: Scene, kind: str, number: int, epoch: int) -> tuple[tuple[str, int], ...]:
-    """Keys of the poses that make up the pose of a node in the world, carriers first."""
-    if kind == "station":
-        return (("station", int(scene.station_row[number, epoch])),)
-    bodies = scene.model.cameras if kind == "camera" else scene.model.targets
-    own = (kind, number if kind == "camera" else int(scene.target_row[number, epoch]))
-    carrier = bodies[number].station
-    if not carrier:
-        return (own,)
-    return (("station", int(scene.station_row[scene.station_places[carrier], epoch])), own)
-
-
-def _given(scene: Scene) -> dict[tuple[str, int], np.ndarray]:
-    """Poses that the model gives, or that it holds at the identity."""
-    known = {}
-    model = scene.model
-    for i, camera in enumerate(model.cameras):
-        if camera.pose is not None or "pose" not in camera.free:
-            known["camera", i] = _matrix(np.asarray(scene.state.station_from_camera[i]))
-    for kind, bodies, rows, table in (
-        ("station", model.stations, scene.station_row, scene.state.world_from_station),
-        ("target", model.targets, scene.target_row, scene.state.carrier_from_target),
-    ):
-        values = np.asarray(table)
-        for i, body in enumerate(bodies):
-            if body.pose is not None or "pose" not in body.free:
-                for row in np.unique(rows[i]):
-                    known[kind, row] = _matrix(values[row])
+def _with_origin(scene: Scene, relations, known: dict[Key, np.ndarray]) -> dict[Key, np.ndarray]:
+    """Known poses; where nothing stands in the world, the first body seen is at its origin."""
+    if relations and not any(_stands_in_world(scene, key) for key in known):
+        return known | {relations[0].a[0]: np.eye(4)}
     return known
 
 
-def _chain(scene: Scene, relations) -> dict[tuple[str, int], np.ndarray]:
+def _chain(scene: Scene, relations: list[Relation], known: dict[Key, np.ndarray]):
     """Propagate known poses through the relations, best ones first."""
-    known = _given(scene)
-    in_world = {key for key in known if _stands_in_world(scene, key)}
-    if not in_world and relations:
-        known[relations[0][0][0]] = np.eye(4)
+    known = dict(_with_origin(scene, relations, known))
     of_key = defaultdict(list)
     missing = []
-    for k, (a, b, _, _) in enumerate(relations):
-        missing.append({key for key in (*a, *b) if key not in known})
+    for k, relation in enumerate(relations):
+        missing.append({key for key in (*relation.a, *relation.b) if key not in known})
         for key in missing[k]:
             of_key[key].append(k)
     ready = [k for k, keys in enumerate(missing) if len(keys) == 1]
@@ -172,9 +140,8 @@ def _chain(scene: Scene, relations) -> dict[tuple[str, int], np.ndarray]:
     while ready:
         candidates = defaultdict(list)
         for k in ready:
-            a, b, a_from_b, error = relations[k]
             (key,) = missing[k]
-            candidates[key].append((error, _solve(a, b, a_from_b, key, known)))
+            candidates[key].append((relations[k].error, _solve(relations[k], key, known)))
         touched = set()
         for key, options in candidates.items():
             known[key] = _consensus(options)
@@ -194,8 +161,9 @@ def _stands_in_world(scene: Scene, key: tuple[str, int]) -> bool:
     return kind == "station"
 
 
-def _solve(a, b, a_from_b, key, known) -> np.ndarray:
+def _solve(relation: Relation, key: Key, known) -> np.ndarray:
     """The one missing pose of product(a) @ a_from_b = product(b)."""
+    a, b, a_from_b = relation.a, relation.b, relation.pose
 
     def product(chain):
         result = np.eye(4)
@@ -228,26 +196,18 @@ def _consensus(options) -> np.ndarray:
 
 
 def _check_reached(scene: Scene, known, waiting) -> None:
-    missing = {key for a, b, _, _ in waiting for key in (*a, *b) if key not in known}
+    missing = {key for r in waiting for key in (*r.a, *r.b) if key not in known}
     missing |= _observed(scene) - known.keys()
     if not missing:
         return
-    names = set()
-    for kind, row in missing:
-        if kind == "camera":
-            names.add(f'camera "{scene.model.cameras[row].name}"')
-            continue
-        rows = scene.station_row if kind == "station" else scene.target_row
-        bodies = scene.model.stations if kind == "station" else scene.model.targets
-        body = next(i for i in range(len(bodies)) if row in rows[i])
-        names.add(f'{kind} "{bodies[body].name}"')
+    names = {name_of(scene, key) for key in missing}
     raise StartError(
         f"no chain of views or links reaches {', '.join(sorted(names))} from the bodies with a "
         "known pose; give a pose in recording.toml or record a view that joins the parts"
     )
 
 
-def _observed(scene: Scene) -> set[tuple[str, int]]:
+def _observed(scene: Scene) -> set[Key]:
     """Keys of all bodies that an image point depends on."""
     obs, model = scene.recording.observations, scene.model
     places = scene.station_places
@@ -271,7 +231,7 @@ def _with_poses(scene: Scene, known) -> Scene:
     }
     reached = {kind: np.zeros(len(table), bool) for kind, table in tables.items()}
     for (kind, row), pose in known.items():
-        tables[kind][row] = _vector(pose)
+        tables[kind][row] = vector(pose)
         reached[kind][row] = True
     for kind, bodies, rows in (
         ("station", scene.model.stations, scene.station_row),
@@ -322,13 +282,13 @@ def _triangulated(scene: Scene) -> Scene:
             np.asarray(values[i]) for values in (state.focal, state.centre, state.distortion)
         )
         rays = rays_of_pixels(lens_family(camera.lens), focal, centre, distortion, obs.pixel[own])
-        mounted = _matrix(np.asarray(state.station_from_camera[i]))
+        mounted = matrix(np.asarray(state.station_from_camera[i]))
         station = names.index(camera.station)
         for ray, k in zip(rays, own, strict=True):
-            carrier = _matrix(
+            carrier = matrix(
                 np.asarray(state.world_from_station[scene.station_row[station, obs.epoch[k]]])
             )
-            pose = np.linalg.inv(_matrix(world_from_target[k])) @ carrier @ mounted
+            pose = np.linalg.inv(matrix(world_from_target[k])) @ carrier @ mounted
             direction = pose[:3, :3] @ (ray / np.linalg.norm(ray))
             across = np.eye(3) - np.outer(direction, direction)
             normal[row[k]] += across

@@ -21,12 +21,13 @@ _MOST_DAMPING, _LEAST_DAMPING = 1e12, 1e-12
 _UNSEEN = 1e-20
 """Sum of squared residual changes by a unit vector of scaled unknowns that shows nothing at all.
 
-Rounding leaves 1e-30. The eigenvalues of a long chain fall with the fourth power of its length, so
-those of the matrix, which rounding touches at 1e-16, can't tell a weak network from a broken one."""
+Rounding leaves 1e-30. The eigenvalues of a long chain fall with the fourth power of its length:
+those of the matrix, which rounding touches at 1e-16, can't tell a weak network from a broken one.
+"""
 
 
 _DENSE = 1500
-"""Shared unknowns beyond which the dense arrow is slower than sparse factors, and soon too large."""
+"""Shared unknowns beyond which a dense arrow is slower than sparse factors, and soon too large."""
 
 
 def is_large(problem: Problem) -> bool:

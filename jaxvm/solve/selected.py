@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import cvxopt
 import numpy as np
-from cvxopt import amd
+from cvxopt import amd  # pyright: ignore[reportAttributeAccessIssue]
 from jaxtyping import Array, Float, Int
 
 from jaxvm.solve.problem import Problem

@@ -14,7 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from cvxopt import cholmod
+from cvxopt import cholmod  # pyright: ignore[reportAttributeAccessIssue]
 from jaxtyping import Array, Float, Int
 
 from jaxvm.network.residual import linearise
@@ -125,9 +125,8 @@ def _products(problem: Problem, x):
 
     def of_packet(rows, factor, packets: Packets):
         n = factor.slots.shape[0]
-        own = jax.tree.map(
-            lambda leaf: leaf[jnp.minimum(rows, n - 1)] if leaf.ndim else leaf, factor
-        )
+        at = jnp.minimum(rows, n - 1)
+        own = jax.tree.map(lambda leaf: leaf[at] if leaf.ndim else leaf, factor)
         weight = jnp.where(rows < n, own.weight, 0.0)
         raw = linearise(own, network, flat, values, slopes, packets.live)
         (table,) = whitened(
