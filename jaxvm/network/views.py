@@ -45,7 +45,9 @@ def collect_views(recording: Recording) -> list[View]:
     order = np.argsort(where.ravel(), kind="stable")
     ends = np.cumsum(np.bincount(where.ravel(), minlength=len(distinct)))[:-1]
     views = []
-    for (camera, target, epoch), rows in zip(distinct, np.split(order, ends), strict=True):
+    # Without any observation there is still one (empty) piece.
+    pieces = np.split(order, ends)[: len(distinct)]
+    for (camera, target, epoch), rows in zip(distinct, pieces, strict=True):
         points = targets[target].points[obs.point[rows]]
         known = np.isfinite(points).all(axis=1)
         if known.sum() >= MIN_POINTS:

@@ -102,6 +102,7 @@ def adjust(
     loss: Loss | None = None,
     weights: tuple[np.ndarray, ...] | None = None,
     range_weights: np.ndarray | None = None,
+    link_weights: np.ndarray | None = None,
     active: np.ndarray | None = None,
     rtol: float = 1e-12,
     damping: float = 1e-3,
@@ -119,7 +120,7 @@ def adjust(
         method: "levenberg-marquardt" or "gauss-newton".
         loss: robust loss; least squares by default.
         weights: weight of every observation of every pixel table (0 sets it aside).
-        range_weights: the same for the ranges.
+        range_weights, link_weights: the same for the ranges and for the links.
         active: unknowns that may move; all by default.
         rtol: relative change of the cost at which it stops.
         damping: first damping of Levenberg-Marquardt, relative to a unit diagonal.
@@ -134,7 +135,8 @@ def adjust(
     if method not in METHODS:
         raise ValueError(f'there is no method "{method}" (there are: {", ".join(METHODS)})')
     began, compiling = time.perf_counter(), compile_seconds()
-    options = dict(weights=weights, range_weights=range_weights, active=active, loss=loss)
+    options: dict = dict(weights=weights, range_weights=range_weights, link_weights=link_weights)
+    options |= dict(active=active, loss=loss)
     options |= dict(rtol=rtol, damping=damping, max_steps=max_steps)
     found = _adjusted(scene, method, check=check, **options)
     before = np.inf
@@ -176,7 +178,17 @@ def _moved(found: Adjustment) -> float:
 
 
 def _adjusted(
-    scene: Scene, method, loss, weights, range_weights, active, rtol, damping, max_steps, check
+    scene: Scene,
+    method,
+    loss,
+    weights,
+    range_weights,
+    link_weights,
+    active,
+    rtol,
+    damping,
+    max_steps,
+    check,
 ) -> Adjustment:
     """The adjustment with the patterns of the start values."""
     problem = scene_problem(scene, loss)
@@ -186,6 +198,8 @@ def _adjusted(
         problem = eqx.tree_at(
             lambda p: p.network.ranges.weight, problem, jnp.asarray(range_weights)
         )
+    if link_weights is not None:
+        problem = eqx.tree_at(lambda p: p.network.links.weight, problem, jnp.asarray(link_weights))
     if active is not None:
         problem = eqx.tree_at(lambda p: p.active, problem, problem.active & jnp.asarray(active))
     if is_large(problem):

@@ -9,14 +9,18 @@ from dataclasses import dataclass
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 from scipy.stats import chi2
 
+from jaxvm.network.factors import LinkFactor
 from jaxvm.network.scene import Scene
+from jaxvm.recording import Links
 from jaxvm.solve.adjust import Adjustment, adjust
 from jaxvm.solve.arrow import factorise
 from jaxvm.solve.large import is_large
 from jaxvm.solve.problem import Problem
 from jaxvm.solve.reduced import half_rows, packet_of_rows
+from jaxvm.solve.robust import CauchyLoss
 from jaxvm.solve.selected import SelectedInverse
 
 
@@ -41,35 +45,42 @@ def redundancy(adjustment: Adjustment) -> tuple[np.ndarray, ...]:
 
 def _redundancies(problem: Problem, x):
     tables = problem.linearised(x)
+    counted = [np.asarray(factor.weight) > 0.0 for factor in problem.network.factors()]
+    hats = _hats(problem, x, tables)
+    return [
+        used[:, None, None] * np.eye(hat.shape[1]) - hat
+        for used, hat in zip(counted, hats, strict=True)
+    ]
+
+
+def _hats(problem: Problem, x, tables) -> list[np.ndarray]:
+    """J H^-1 J^T of every observation of linearised tables, H being that of the problem."""
     jacobians = [table.jacobian for table in tables]
-    counted = [factor.weight > 0.0 for factor in problem.network.factors()]
     if is_large(problem):
-        return _large_complements(problem, x, jacobians, counted)
-    hessian = problem.assembled(tables).hessian
-    return _complements(hessian, problem.packets, jacobians, counted, problem.sizes)
+        return _large_hats(problem, x, jacobians)
+    hessian = problem.normal(x).hessian
+    return _arrow_hats(hessian, problem.packets, jacobians, problem.sizes)
 
 
 @eqx.filter_jit
-def _complements(hessian, packets_of, jacobians, counted, sizes):
+def _arrow_hats(hessian, packets_of, jacobians, sizes):
     factors = factorise(hessian)
     result = []
-    for packets, jacobian, used in zip(packets_of, jacobians, counted, strict=True):
+    for packets, jacobian in zip(packets_of, jacobians, strict=True):
         half = half_rows(factors, packets, jacobian, sizes)
-        hat = jnp.einsum("nak,nbk->nab", half, half)
-        result.append(used[:, None, None] * jnp.eye(hat.shape[1]) - hat)
+        result.append(jnp.einsum("nak,nbk->nab", half, half))
     return result
 
 
-def _large_complements(problem: Problem, x, jacobians, counted) -> list[np.ndarray]:
+def _large_hats(problem: Problem, x, jacobians) -> list[np.ndarray]:
     """The same through the selected inverse: an observation needs its own unknowns' block only."""
     inverse = SelectedInverse.of(problem, x)
     result = []
-    for packets, jacobian, used in zip(problem.packets, jacobians, counted, strict=True):
+    for packets, jacobian in zip(problem.packets, jacobians, strict=True):
         blocks = inverse.blocks(np.asarray(packets.columns))
         jacobian = np.asarray(jacobian)
-        packet = np.asarray(packet_of_rows(packets, len(jacobian)))
-        hat = np.einsum("nak,nkl,nbl->nab", jacobian, blocks[packet], jacobian, optimize=True)
-        result.append(np.asarray(used)[:, None, None] * np.eye(hat.shape[1]) - hat)
+        own = blocks[np.asarray(packet_of_rows(packets, len(jacobian)))]
+        result.append(np.einsum("nak,nkl,nbl->nab", jacobian, own, jacobian, optimize=True))
     return result
 
 
@@ -130,6 +141,98 @@ def image_point_tests(adjustment: Adjustment) -> list[np.ndarray]:
         v = np.asarray(r)
         tests.append(np.einsum("na,na->n", v, np.linalg.solve(block, v[:, :, None])[:, :, 0]))
     return tests
+
+
+_CHECKED = 1e-6
+"""Redundancy of a combination of components below which nothing checks it."""
+
+
+def link_tests(adjustment: Adjustment) -> tuple[Float[np.ndarray, " links"], np.ndarray]:
+    """Test values of all links, and the degrees of freedom of each.
+
+    A link in use has v^T R^- v, R its redundancy; what nothing else checks counts nothing. One that
+    is set aside has v^T (I + J H^-1 J^T)^-1 v: it is compared with what the others foretell.
+    """
+    problem, x = adjustment.problem, adjustment.x
+    factors = problem.network.factors()
+    place = next(i for i, factor in enumerate(factors) if isinstance(factor, LinkFactor))
+    used = np.asarray(factors[place].weight) > 0.0
+    # Linearised with all of them in use; the normal equations are those of the adjustment.
+    every = eqx.tree_at(lambda p: p.network.links.weight, problem, jnp.ones(len(used)))
+    tables = every.linearised(x)
+    hat = np.asarray(_hats(problem, x, tables)[place])
+    value, vector = np.linalg.eigh(np.eye(6) + np.where(used[:, None, None], -hat, hat))
+    checked = value > _CHECKED
+    along = np.einsum("nij,ni->nj", vector, np.asarray(tables[place].value))
+    squares = np.where(checked, along**2 / np.where(checked, value, 1.0), 0.0)
+    return squares.sum(axis=1), checked.sum(axis=1)
+
+
+def snoop_links(
+    scene: Scene,
+    alpha: float = 0.001,
+    method: str = "levenberg-marquardt",
+    max_rounds: int = 20,
+) -> tuple[Adjustment, list[Rejected], Float[np.ndarray, " links"]]:
+    """Adjust a network and reject links with gross errors, by name.
+
+    A robust adjustment (Cauchy) first takes the network to where most links agree, and sets aside
+    what is far off there. Then rounds of least squares: of the links that fail, those that are
+    worst at both of their bodies are set aside, and those that pass again come back.
+
+    Args:
+        scene: with links, at start values.
+        alpha: probability to reject one sound link (Baarda 1968).
+        method: of `adjust`.
+        max_rounds: bound on the rounds.
+
+    Returns:
+        The last adjustment, the rejected links (`row` counts links), and the weights of all.
+
+    Raises:
+        ValueError: the recording has no links.
+    """
+    links = scene.recording.links
+    if links is None:
+        raise ValueError("the recording has no links; image points are snooped by `snoop`")
+    robust = adjust(scene, method, CauchyLoss())
+    square = np.sum(np.asarray(robust.residuals().links) ** 2, axis=1)
+    weights = np.where(square > _FAR * chi2.isf(alpha, 6), 0.0, 1.0)
+    tried: set[bytes] = set()
+    while True:
+        tried.add(weights.tobytes())
+        adjustment = adjust(robust.scene, method, link_weights=weights, check=False)
+        test, freedom = link_tests(adjustment)
+        fails = test > chi2.isf(alpha, np.maximum(freedom, 1))
+        changed = np.where((weights == 0.0) & ~fails, 1.0, weights)
+        changed[_worst_at_both_ends(links, np.where(fails & (weights > 0.0), test, 0.0))] = 0.0
+        if changed.tobytes() in tried or len(tried) >= max_rounds:
+            break
+        weights = changed
+    rejected = [
+        Rejected(int(k), float(test[k]), f"link {links.name[k]}")
+        for k in np.flatnonzero(weights == 0.0)
+    ]
+    return adjustment, rejected, weights
+
+
+_FAR = 4.0
+"""How many times the limit of a test a robust residual has to be for the link to be set aside."""
+
+
+def _worst_at_both_ends(links: Links, value: np.ndarray) -> np.ndarray:
+    """Links whose (positive) value is the largest among all links at both of their bodies."""
+    bodies: dict[tuple[str, int], int] = {}
+    ends = np.array(
+        [
+            [bodies.setdefault(node, len(bodies)) for node in pair]
+            for pair in zip(links.from_node, links.to_node, strict=True)
+        ]
+    )
+    largest = np.zeros(len(bodies))
+    for side in (0, 1):
+        np.maximum.at(largest, ends[:, side], value)
+    return np.flatnonzero((value > 0.0) & (value >= largest[ends].max(axis=1)))
 
 
 def robust_variance(adjustment: Adjustment) -> float:

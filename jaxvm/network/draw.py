@@ -1,0 +1,68 @@
+"""Measurements drawn about a state: the same prediction as everywhere, plus noise."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from jaxvm.geometry.poses import pose_from_vector, se3_exp, vector_from_pose
+from jaxvm.network.factors import Factor, LinkFactor
+from jaxvm.network.residual import Network, parts_of, rows
+from jaxvm.network.state import State
+from jaxvm.physics.effects import courses
+
+
+def drawn(network: Network, state: State, key: PRNGKeyArray, scale: float = 1.0) -> Network:
+    """The network with measurements drawn anew about a state.
+
+    Every table gets its prediction at the state plus independent normal noise of its own sigmas
+    (or covariances) times `scale`; loop closures stay what they are. Pure: `jax.jit` and `jax.vmap`
+    apply.
+    """
+    flat = state.flatten()
+    values = courses(network.effects, state.constant, network.channels)
+    keys = iter(jax.random.split(key, len(network.pixels) + 4))
+
+    def off(factor: Factor) -> Float[Array, "observations components"]:
+        """Predicted minus measured, plus noise."""
+        noise = jax.random.normal(next(keys), factor.sigma.shape)
+        return rows(factor, network, flat, values) + scale * factor.sigma * noise
+
+    pixels = [factor.circumstances.pixel + off(factor) for factor in network.pixels]
+    network = eqx.tree_at(lambda n: [f.circumstances.pixel for f in n.pixels], network, pixels)
+    if network.ranges is not None:
+        measured = network.ranges.measured + off(network.ranges)[:, 0]
+        network = eqx.tree_at(lambda n: n.ranges.measured, network, measured)
+    if network.priors is not None:
+        expected = network.priors.expected - off(network.priors)[:, 0]
+        network = eqx.tree_at(lambda n: n.priors.expected, network, expected)
+    if network.links is not None:
+        own = _true_links(network.links, flat)
+        measured = _measured(own, network.links.root, next(keys), scale)
+        network = eqx.tree_at(lambda n: n.links.measured, network, measured)
+    if network.edges is not None:
+        measured = _measured(state.link, network.edges.root, next(keys), scale)
+        network = eqx.tree_at(lambda n: n.edges.measured, network, measured)
+    return network
+
+
+@jax.vmap
+def _relative(a: Array, on_a: Array, b: Array, on_b: Array) -> Float[Array, "6"]:
+    """from_from_to of two bodies on their carriers."""
+    poses = [pose_from_vector(vector) for vector in (a, on_a, b, on_b)]
+    return vector_from_pose((poses[0] @ poses[1]).inverse() @ poses[2] @ poses[3])
+
+
+def _true_links(factor: LinkFactor, flat) -> Float[Array, "links 6"]:
+    return _relative(*parts_of(factor, flat))
+
+
+def _measured(true, root, key, scale) -> Float[Array, "links 6"]:
+    """Measured poses whose twist log(measured^-1 . true) has the covariance (root^T root)^-1."""
+    white = scale * jax.random.normal(key, true.shape)
+
+    def one(true, root, white):
+        twist = jnp.linalg.solve(root, white)
+        return vector_from_pose(pose_from_vector(true) @ se3_exp(-twist))
+
+    return jax.vmap(one)(true, root, white)

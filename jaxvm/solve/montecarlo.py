@@ -1,0 +1,158 @@
+"""Monte Carlo of whole networks: measurements drawn anew, adjusted again, errors against theory.
+
+A trial is the adjustment of a scene whose measurements were drawn about its present state. Trials
+are one program under `vmap`: the same residual, the same normal equations.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from scipy.stats import chi2
+
+from jaxvm.network.draw import drawn
+from jaxvm.network.scene import Scene
+from jaxvm.network.state import State
+from jaxvm.solve.arrow import factorise
+from jaxvm.solve.gauge import check_gauge
+from jaxvm.solve.large import is_large
+from jaxvm.solve.problem import Problem, normal_at, scaled, scene_problem
+
+Quantity = Callable[[State], Float[Array, " m"]]
+
+_STEPS = 20
+_SETTLED = 1e-7
+"""Largest change of a unit-diagonal unknown at which a trial has converged."""
+
+
+@dataclass(frozen=True, eq=False)
+class MonteCarlo:
+    """Errors of a quantity over many trials, and what theory foretells.
+
+    Attributes:
+        errors: estimate minus truth of the trials that converged.
+        covariance: that of the Gauss-Newton matrix at the truth.
+        cost: half the sum of squares of each of these trials.
+        degrees_of_freedom: observations minus unknowns.
+        failed: which of all trials did not converge.
+    """
+
+    errors: Float[np.ndarray, "trials m"]
+    covariance: Float[np.ndarray, "m m"]
+    cost: Float[np.ndarray, " trials"]
+    degrees_of_freedom: int
+    failed: Bool[np.ndarray, " all_trials"]
+
+    @property
+    def predicted(self) -> Float[np.ndarray, " m"]:
+        """Standard deviations that theory foretells."""
+        return np.sqrt(np.diagonal(self.covariance))
+
+    @property
+    def measured(self) -> Float[np.ndarray, " m"]:
+        """Root mean square errors of the trials."""
+        return np.sqrt(np.mean(self.errors**2, axis=0))
+
+    def interval(self, level: float = 0.95) -> Float[np.ndarray, "2 m"]:
+        """Interval of the true root mean square errors (chi-square)."""
+        n = len(self.errors)
+        bounds = chi2.ppf([0.5 + 0.5 * level, 0.5 - 0.5 * level], n)
+        return self.measured * np.sqrt(n / bounds)[:, None]
+
+    @property
+    def chi_square(self) -> float:
+        """Mean of e^T C^+ e over the rank of C: 1 where the predicted covariance is right."""
+        values, vectors = np.linalg.eigh(self.covariance)
+        kept = values > 1e-10 * values[-1]
+        white = self.errors @ vectors[:, kept] / np.sqrt(values[kept])
+        return float(np.mean(white**2))
+
+
+def montecarlo(
+    scene: Scene,
+    quantity: Quantity,
+    key: PRNGKeyArray,
+    trials: int = 1000,
+    batch: int = 128,
+    progress: Callable[[int], None] | None = None,
+) -> MonteCarlo:
+    """Adjust a scene many times, its measurements drawn about its present state.
+
+    Trials start at the truth and take Gauss-Newton steps.
+
+    Args:
+        scene: at the true state; its sigmas are those of the noise.
+        quantity: of the state, whose errors count; differentiable.
+        key: of the noise; trial k is the same whatever the number of trials and the batch.
+        trials: how many.
+        batch: how many at a time.
+        progress: told after each batch how many trials are done.
+
+    Raises:
+        RankDeficiency: the scene does not determine its unknowns.
+        ValueError: the network is too large for dense trials.
+    """
+    problem = scene_problem(scene)
+    if is_large(problem):
+        raise ValueError(
+            f"{problem.sizes[0]} shared unknowns are too many for trials in batches; "
+            "take the covariance of one adjustment, or a smaller network"
+        )
+    problem, normal = scaled(problem, normal_at(problem, jnp.zeros(problem.n)))
+    check_gauge(normal, scene.unknowns)
+    keys = jax.vmap(lambda k: jax.random.fold_in(key, k))(jnp.arange(-(-trials // batch) * batch))
+    parts = []
+    for first in range(0, trials, batch):
+        found = _trials(problem, quantity, keys[first : first + batch])
+        parts.append(jax.tree.map(np.asarray, found))
+        if progress is not None:
+            progress(min(first + batch, trials))
+    errors, cost, converged = (np.concatenate(part)[:trials] for part in zip(*parts, strict=True))
+    used = sum(
+        int(np.sum(np.asarray(f.weight) > 0)) * f.sigma.shape[1] for f in problem.network.factors()
+    )
+    return MonteCarlo(
+        errors=errors[converged],
+        covariance=np.asarray(_covariance(problem, quantity)),
+        cost=cost[converged],
+        degrees_of_freedom=used - int(np.sum(np.asarray(normal.hessian.diagonal()) > 0)),
+        failed=~converged,
+    )
+
+
+@eqx.filter_jit
+def _trials(problem: Problem, quantity: Quantity, keys):
+    """Errors, costs, and whether each trial converged."""
+    truth = problem.state(jnp.zeros(problem.n))
+    aim = jnp.ravel(quantity(truth))
+
+    def one(key):
+        own = eqx.tree_at(lambda p: p.network, problem, drawn(problem.network, truth, key))
+
+        def step(state):
+            x, _, k = state
+            normal = own.normal(x)
+            change = -factorise(normal.hessian).solve(normal.gradient)
+            return x + change, jnp.max(jnp.abs(change)), k + 1
+
+        def going(state):
+            _, change, k = state
+            return (change > _SETTLED) & (k < _STEPS)
+
+        x, change, _ = jax.lax.while_loop(
+            going, step, (jnp.zeros(problem.n), jnp.array(jnp.inf), jnp.array(0))
+        )
+        return jnp.ravel(quantity(own.state(x))) - aim, own.cost(x), change <= _SETTLED
+
+    return jax.vmap(one)(keys)
+
+
+@eqx.filter_jit
+def _covariance(problem: Problem, quantity: Quantity):
+    x = jnp.zeros(problem.n)
+    rows = jax.jacrev(lambda y: jnp.ravel(quantity(problem.state(y))))(x)
+    return rows @ factorise(problem.normal(x).hessian).solve(rows.T)
