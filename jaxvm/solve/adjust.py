@@ -12,12 +12,30 @@ import optimistix as optx
 from jaxvm.network.residual import Residuals, residual
 from jaxvm.network.scene import Scene
 from jaxvm.solve.compiling import compile_seconds
+from jaxvm.solve.descent import Descent
 from jaxvm.solve.gauge import check_gauge
 from jaxvm.solve.large import check_large_gauge, is_large, minimise_large, scaled_large
+from jaxvm.solve.lbfgs import minimise_lbfgs
 from jaxvm.solve.optimise import METHODS, minimise
 from jaxvm.solve.problem import Problem, normal_at, scaled, scene_problem
 from jaxvm.solve.robust import Loss
 from jaxvm.solve.sparse import Pattern, SparseFactors
+from jaxvm.solve.spgd import minimise_spgd
+
+
+def _spgd(problem: Problem, max_steps: int) -> Descent:
+    return minimise_spgd(problem, jax.random.key(0), max_evaluations=max(max_steps, _MOST_COSTS))
+
+
+def _lbfgs(problem: Problem, max_steps: int) -> Descent:
+    return minimise_lbfgs(problem, max_evaluations=max(max_steps, _MOST_COSTS))
+
+
+DESCENTS = {"spgd": _spgd, "lbfgs": _lbfgs}
+"""Methods of `adjust` that know the cost (and its gradient) alone."""
+
+_MOST_COSTS = 200_000
+"""Evaluations of the cost that such a method has at least."""
 
 _SAME = 1.0
 """Sum of squared changes of whitened residuals up to which the patterns of effects are the same."""
@@ -34,9 +52,10 @@ class Adjustment:
         cost_before, cost: half the sum of (robust) squared whitened residuals.
         degrees_of_freedom: observations minus unknowns.
         evaluations, accepted: steps tried and taken.
-        history: cost after each evaluation.
+        history: cost after each evaluation, or after those in `evaluations_at`.
         why: why it stopped.
         seconds, seconds_compiling: of this call.
+        evaluations_at: evaluations at each entry of the history, where it does not have all.
     """
 
     scene: Scene
@@ -51,6 +70,7 @@ class Adjustment:
     why: str
     seconds: float
     seconds_compiling: float
+    evaluations_at: np.ndarray | None = None
 
     @property
     def variance_factor(self) -> float:
@@ -117,7 +137,8 @@ def adjust(
 
     Args:
         scene: scene at its start values.
-        method: "levenberg-marquardt" or "gauss-newton".
+        method: "levenberg-marquardt" or "gauss-newton"; "spgd" (stochastic parallel gradient
+            descent) and "lbfgs" for comparison.
         loss: robust loss; least squares by default.
         weights: weight of every observation of every pixel table (0 sets it aside).
         range_weights, link_weights: the same for the ranges and for the links.
@@ -132,8 +153,9 @@ def adjust(
         RankDeficiency: unknowns that the observations don't determine, by name.
         ValueError: an unknown method.
     """
-    if method not in METHODS:
-        raise ValueError(f'there is no method "{method}" (there are: {", ".join(METHODS)})')
+    known = (*METHODS, *DESCENTS)
+    if method not in known:
+        raise ValueError(f'there is no method "{method}" (there are: {", ".join(known)})')
     began, compiling = time.perf_counter(), compile_seconds()
     options: dict = dict(weights=weights, range_weights=range_weights, link_weights=link_weights)
     options |= dict(active=active, loss=loss)
@@ -207,6 +229,9 @@ def _adjusted(
     problem, normal = scaled(problem, normal_at(problem, jnp.zeros(problem.n)))
     if check:
         check_gauge(normal, scene.unknowns)
+    if method in DESCENTS:
+        freedom = degrees_of_freedom(problem, normal.hessian.diagonal())
+        return _descended(scene, problem, DESCENTS[method](problem, max_steps), freedom)
     solver = METHODS[method](
         jnp.asarray(rtol), limit=jnp.asarray(max_steps), damping=jnp.asarray(damping)
     )
@@ -231,6 +256,25 @@ def _adjusted(
     )
 
 
+def _descended(scene: Scene, problem: Problem, found: Descent, freedom: int) -> Adjustment:
+    """The adjustment by a method that knows costs (and gradients) alone."""
+    return Adjustment(
+        scene=scene.with_state(_state(problem, found.x)),
+        problem=problem,
+        x=found.x,
+        cost_before=float(found.history[0]),
+        cost=found.cost,
+        degrees_of_freedom=freedom,
+        evaluations=found.evaluations,
+        accepted=found.evaluations,
+        history=found.history,
+        why=found.why,
+        seconds=0.0,
+        seconds_compiling=0.0,
+        evaluations_at=found.evaluations_at,
+    )
+
+
 def _adjusted_large(
     scene: Scene, problem: Problem, method, rtol, damping, max_steps, check
 ) -> Adjustment:
@@ -240,6 +284,9 @@ def _adjusted_large(
     problem, normal = scaled_large(problem, pattern)
     if check:
         check_large_gauge(problem, normal, factors, scene.unknowns)
+    if method in DESCENTS:
+        freedom = degrees_of_freedom(problem, normal.diagonal())
+        return _descended(scene, problem, DESCENTS[method](problem, max_steps), freedom)
     fit = minimise_large(
         problem, normal, factors, method, rtol=rtol, limit=max_steps, damping=damping
     )
