@@ -1,5 +1,7 @@
 """Measurements drawn about a state: the same prediction as everywhere, plus noise."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -28,8 +30,13 @@ def drawn(network: Network, state: State, key: PRNGKeyArray, scale: float = 1.0)
         noise = jax.random.normal(next(keys), factor.sigma.shape)
         return rows(factor, network, flat, values) + scale * factor.sigma * noise
 
-    pixels = [factor.circumstances.pixel + off(factor) for factor in network.pixels]
-    network = eqx.tree_at(lambda n: [f.circumstances.pixel for f in n.pixels], network, pixels)
+    pixels = tuple(
+        eqx.tree_at(
+            lambda f: f.circumstances.pixel, factor, factor.circumstances.pixel + off(factor)
+        )
+        for factor in network.pixels
+    )
+    network = replace(network, pixels=pixels)
     if network.ranges is not None:
         measured = network.ranges.measured + off(network.ranges)[:, 0]
         network = eqx.tree_at(lambda n: n.ranges.measured, network, measured)
