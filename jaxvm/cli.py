@@ -140,14 +140,30 @@ def _parser() -> argparse.ArgumentParser:
     compensate.add_argument("--out", type=Path, required=True, metavar="RECORDING")
 
     simulate = command("simulate", _simulate, "write a simulated recording")
-    simulate.add_argument("scene", choices=("deformation",), help="what to simulate")
-    simulate.add_argument("--out", type=Path, required=True, metavar="RECORDING")
     simulate.add_argument(
-        "--hide", default="nothing", metavar="EFFECT", help="effects, with commas"
+        "scene",
+        help='"deformation" (a world of its own, where physics is hidden), a network of the '
+        "examples by its name (ship, tunnel, bridge, wind-tunnel, chain, double-chain, ring, "
+        "station, random), or a TOML that describes one",
     )
-    simulate.add_argument("--seed", type=_natural, default=0)
-    simulate.add_argument("--size", choices=("full", "small"), default="full")
-    simulate.add_argument("--strength", type=float, default=1.0, help="factor on every effect")
+    simulate.add_argument("--out", type=Path, required=True, metavar="RECORDING")
+    simulate.add_argument("--seed", type=_natural, default=0, help="of the noise")
+    simulate.add_argument(
+        "--truth",
+        type=Path,
+        default=None,
+        metavar="DIR",
+        help='networks: folder for what is true; beside the recording, with "-truth"',
+    )
+    simulate.add_argument(
+        "--hide", default=None, metavar="EFFECT", help="deformation: effects, with commas"
+    )
+    simulate.add_argument(
+        "--size", choices=("full", "small"), default=None, help="deformation: full by default"
+    )
+    simulate.add_argument(
+        "--strength", type=float, default=None, help="deformation: factor on every effect"
+    )
 
     convert = command("convert", _convert, "make a recording of other programs' files")
     convert.add_argument(
@@ -350,18 +366,49 @@ def _compensate(options):
 
 
 def _simulate(options):
+    if options.scene != "deformation":
+        return _simulate_network(options)
     from jaxvm.demo import hidden_keys
     from jaxvm.recording.files import new_folder
     from jaxvm.simulate import simulate_deformation_scene
 
+    if options.truth is not None:
+        raise ValueError("--truth is for networks; what deformation hides is printed")
     made = simulate_deformation_scene(
-        hidden_keys(options.hide), options.seed, options.size, options.strength
+        hidden_keys("nothing" if options.hide is None else options.hide),
+        options.seed,
+        options.size or "full",
+        1.0 if options.strength is None else options.strength,
     )
     with new_folder(options.out) as staging:
         made.write(staging)
     hidden = " ".join(truth.sentence for truth in made.truth) or "nothing"
     answer = {"recording": str(options.out), "hidden": [truth.effect for truth in made.truth]}
     return answer, f"written    {options.out}\nhidden     {hidden}"
+
+
+def _simulate_network(options):
+    from jaxvm.recording import describe
+    from jaxvm.scenes import read_description, simulate_network
+    from jaxvm.solve.compiling import keep_compiled
+
+    for name in ("hide", "size", "strength"):
+        if getattr(options, name) is not None:
+            raise ValueError(
+                f"--{name} is for deformation; what a network hides stands in its TOML, as "
+                '[[effects]] with model = "hidden"'
+            )
+    keep_compiled()
+    made = simulate_network(read_description(options.scene), options.seed)
+    truth = made.write(options.out, options.truth)
+    told, hidden = describe(made.recording), list(made.truth.hidden)
+    answer = {
+        "recording": str(options.out),
+        "truth": str(truth),
+        "contents": told,
+        "hidden": hidden,
+    }
+    return answer, f"written    {options.out}: {told}\ntruth      {truth}"
 
 
 def _convert(options):

@@ -1,0 +1,484 @@
+"""A network described in a short TOML: every key checked, every default resolved.
+
+Ten lines make a scene; only `layout` is needed:
+
+    layout = "ship"
+    [time]
+    epochs = 24
+    [deformation]
+    bending_m = 0.02
+
+| table and key | default | meaning |
+|---|---|---|
+| `layout` | | ship, tunnel, bridge, wind-tunnel, chain, ring, station, random |
+| `name` | the layout | what the recording is called |
+| `stations` | by layout | number of stations (wind-tunnel: outer ones and sections of the model) |
+| `held` | `[first]` | names of the stations whose poses are given: the gauge |
+| `observe` | `"pixels"` | pixels, links (relative poses alone) or both |
+| `seed` | 0 | draws what is random in the network; the noise has a seed of its own |
+| **[structure]** | | sizes of the layout: |
+| `length_m`, `width_m` | 120, 16 | ship, with `decks` = 2 and `deck_height_m` = 6 |
+| `length_m`, `width_m` | 200, 10 | tunnel, with `radius_m` = 400 of its curve |
+| `length_m`, `width_m` | 300, 12 | bridge, with `towers` = 2, `tower_height_m` = 60 and \
+`tower_stations` = 2 on each |
+| `outer` | 4 | wind-tunnel: stations around the model, with `span_m` = 2 and `distance_m` = 3 |
+| `spacing_m` | 10 | chain, ring, random: from station to station |
+| `distance_m` | 3 | station: from its cameras to the frame around, with `moved_m` = 0.1 and \
+`moved_rad` = 0.05, by which the frame is moved in every epoch |
+| **[sights]** | | who sees whom: |
+| `reach_m` | by layout | how far cameras see |
+| `both_ways` | by layout | whether a line is looked along from both ends (ship, tunnel, bridge) |
+| `redundancy` | 3 | random: mean number of sight lines per station |
+| **[cameras]** | | |
+| `each` | `"sight"` | one camera for each sight line, or `"sector"`s all around |
+| `count` | 6 | cameras of the layout station; sectors of a station (4) |
+| `focal_px` | by layout | sectors: a tenth wider than they have to be |
+| `image_size` | `[2448, 2048]` | px |
+| `lens`, `distortion` | `"pinhole"` | as in recording.toml; known |
+| `margin_px` | 20 | border of the image where no mark is used |
+| `pose` | `"known"` | on the station: known, or free from a rough start value |
+| **[marks]** | | what stations carry to be seen: |
+| `kind` | `"body"` | body: marks in 3-D, seen from all sides; plate: one grid, towards all \
+who see it; plates: a grid for each of them |
+| `count` | 16, 4 | marks of a body; rows and columns of a plate |
+| `size_m` | by layout | diameter of the body, side of the plate |
+| `tilt_deg` | 0 | turn of a plate out of the line of sight; 30 gives twenty times better turns |
+| `incidence_deg` | 65 | steepest view in which the marks of a plate are found |
+| **[time]** | | |
+| `epochs` | 1 | |
+| `interval_s` | 600 | |
+| **[deformation]** | none | stations that are not held move: |
+| `bending_m`, `sway_m` | 0 | up and down, and to the sides, at the far end |
+| `settling_m` | 0 | down at the far end, for good |
+| `torsion_rad` | 0 | about the long axis, at the far end |
+| `period_s` | all epochs | of these modes |
+| **[temperature]** | none | a day, logged in drivers.csv: |
+| `mean_degC`, `swing_K` | 15, 8 | of the air |
+| `rise_K` | 12 | of a camera's body above the air, when it has warmed up |
+| `body_lag_s` | 2400 | time constant of a body |
+| `bodies` | true | whether the bodies of the cameras are logged |
+| `every_s` | 300 | from reading to reading |
+| `noise_K` | 0.01 | of a reading |
+| **[[effects]]** | none | what temperature does to the cameras: |
+| `port`, `per_K` | | a port of mount, lens, sensor or detection, in its unit per kelvin |
+| `driver` | `"body"` | of each camera its body, or `"ambient"` |
+| `lag_s` | 0 | time constant with which it follows |
+| `model` | `"hidden"` | known (amplitude given as start), free (start at zero), hidden: not \
+in the model |
+| `camera` | all | names of cameras |
+| **[links]** | | relative poses of the stations along the lines: |
+| `sigma_rad`, `sigma_m` | 5e-5, 2e-4 | standard deviations |
+| `turn_factor` | 1 | how much worse turns out of the image plane are than the roll |
+| `depth_factor` | 1 | how much worse the depth is than the sides |
+| **[noise]** | | |
+| `pixel_px` | 0.05 | of an image coordinate |
+"""
+
+import tomllib
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+
+from jaxvm.physics.ports import PORTS
+from jaxvm.recording.entries import Entry
+from jaxvm.recording.errors import RecordingError, did_you_mean
+from jaxvm.recording.model import LENSES
+from jaxvm.scenes.deform import MODES
+from jaxvm.scenes.layouts import LAYOUTS
+
+_ROOT = ("name", "layout", "stations", "held", "observe", "seed", "structure", "sights", "cameras",
+         "marks", "time", "deformation", "temperature", "effects", "links", "noise")  # fmt: skip
+
+CAMERA_PORTS = tuple(p.name for p in PORTS if p.stage in ("mount", "lens", "sensor", "detection"))
+"""Ports that a temperature of a camera may drive."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cameras:
+    """What cameras a station has; `focal_px` None: what sectors need."""
+
+    each: str
+    count: int
+    focal_px: float
+    image_size: tuple[int, int]
+    lens: str
+    distortion: np.ndarray
+    margin_px: float
+    free: bool
+
+
+@dataclass(frozen=True)
+class Marks:
+    """What a station carries to be seen (m, rad)."""
+
+    kind: str
+    count: int
+    size_m: float
+    tilt: float
+    incidence: float
+
+
+@dataclass(frozen=True)
+class Temperature:
+    """A day, and how bodies of cameras follow (degC, K, s)."""
+
+    mean_degC: float
+    swing_K: float
+    rise_K: float
+    body_lag_s: float
+    bodies: bool
+    every_s: float
+    noise_K: float
+
+
+@dataclass(frozen=True)
+class ThermalEffect:
+    """What a temperature does to cameras: port, size per kelvin, driver, lag (s), and whether the
+    model knows it, estimates it or has nothing of it."""
+
+    port: str
+    per_K: float
+    driver: str
+    lag_s: float
+    model: str
+    camera: tuple[str, ...]
+    entry: Entry
+
+
+@dataclass(frozen=True)
+class LinkNoise:
+    """Standard deviations of links, and how much worse the bad directions are."""
+
+    sigma_rad: float
+    sigma_m: float
+    turn_factor: float
+    depth_factor: float
+
+
+@dataclass(frozen=True, eq=False)
+class Description:
+    """A described network, with all defaults; the table in the module's head says what is what.
+
+    Attributes:
+        source: the file's content, for errors with its lines.
+        file: its name.
+        structure: sizes of the layout.
+        deformation: amplitude of each mode; empty: nothing moves.
+    """
+
+    source: Entry
+    file: str
+    name: str
+    layout: str
+    stations: int
+    held: tuple[str, ...]
+    observe: str
+    seed: int
+    structure: dict[str, float]
+    reach_m: float | None
+    both_ways: bool
+    redundancy: float
+    cameras: Cameras
+    marks: Marks
+    epochs: int
+    interval_s: float
+    deformation: dict[str, float]
+    period_s: float
+    temperature: Temperature | None
+    effects: tuple[ThermalEffect, ...]
+    links: LinkNoise
+    pixel_px: float
+
+    def error(self, table: str, key: str | None, problem: str) -> RecordingError:
+        """Error at a key of a table ("": of the file itself), with the file and its line."""
+        entry = self.source.entry(table) if table else self.source
+        if table and table not in self.source:
+            # What is not written has no line: the layout it comes from has one.
+            entry, key = self.source, "layout"
+        return self.error_at(entry, key, problem)
+
+    def error_at(self, entry: Entry, key: str | None, problem: str) -> RecordingError:
+        """Error at a key of an entry of the file (None: at the entry itself)."""
+        return _named(entry.error(key, problem), self.file)
+
+
+def example_names() -> tuple[str, ...]:
+    """Names of the examples that come with the package."""
+    files = resources.files("jaxvm.scenes").joinpath("examples").iterdir()
+    return tuple(sorted(file.name[:-5] for file in files if file.name.endswith(".toml")))
+
+
+def read_description(scene: str | Path) -> Description:
+    """A network from its TOML file, or an example by its name.
+
+    Raises:
+        RecordingError: there is no such file or example, or something in it is wrong; names the
+            file, the line and the mend.
+    """
+    name, path = str(scene), Path(scene)
+    if name in example_names() and not path.is_file():
+        file = resources.files("jaxvm.scenes").joinpath("examples", f"{name}.toml")
+        return parse_description(file.read_text(encoding="utf-8"), f"{name}.toml")
+    if not path.is_file():
+        known = ", ".join(("deformation", *example_names()))
+        raise RecordingError(
+            f"{name}: there is no such file, and no example of that name ({known}); "
+            'write one, `layout = "chain"` is enough'
+        )
+    try:
+        return parse_description(path.read_text(encoding="utf-8"), path.name)
+    except UnicodeDecodeError:
+        raise RecordingError(f"{path.name}: it is not a text in UTF-8; save it as one") from None
+
+
+def parse_description(text: str, file: str = "scene.toml") -> Description:
+    """A network from the text of its TOML.
+
+    Raises:
+        RecordingError: as `read_description`.
+    """
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as problem:
+        raise RecordingError(f"{file}: this is not valid TOML: {problem}; mend it") from None
+    try:
+        return _description(Entry(table, text), file)
+    except RecordingError as problem:
+        raise _named(problem, file) from None
+
+
+def _named(problem: RecordingError, file: str) -> RecordingError:
+    """The error of `Entry`, which knows one file only, with the name of this one."""
+    return RecordingError(str(problem).replace("recording.toml", file))
+
+
+def _description(root: Entry, file: str) -> Description:
+    root.only(_ROOT)
+    name = root.choice("layout", tuple(LAYOUTS))
+    layout = LAYOUTS[name]
+    stations = _count(root, "stations", layout.stations, layout.least)
+    if name == "station" and stations != 1:
+        root.fail("stations", 'layout "station" is one station; give cameras.count in its place')
+    structure = _structure(root.entry("structure"), name)
+    sights = root.entry("sights").only(("reach_m", "both_ways", "redundancy"))
+    if "redundancy" in sights and name != "random":
+        sights.fail(
+            "redundancy",
+            f'only layout "random" draws its lines; layout "{name}" has those that sights.reach_m '
+            "allows",
+        )
+    if "both_ways" in sights and name in ("wind-tunnel", "station", "random"):
+        sights.fail("both_ways", f'lines of layout "{name}" have one direction; drop both_ways')
+    observe = root.choice("observe", ("pixels", "links", "both"), "pixels")
+    if name == "station" and observe == "both":
+        root.fail("observe", 'layout "station" has either "pixels" or "links"; choose one')
+    time = root.entry("time").only(("epochs", "interval_s"))
+    epochs = _count(time, "epochs", 1)
+    interval = time.positive("interval_s", 600.0)
+    if observe == "links" and epochs > 1:
+        time.fail("epochs", 'links alone have one epoch; set observe = "both" or epochs = 1')
+    deformation, period = _deformation(root, epochs, interval, name)
+    temperature = _temperature(root, observe)
+    return Description(
+        source=root,
+        file=file,
+        name=root.string("name", name),
+        layout=name,
+        stations=stations,
+        held=tuple(root.names("held") or ()),
+        observe=observe,
+        seed=_count(root, "seed", 0, 0),
+        structure=structure,
+        reach_m=sights.positive("reach_m", 1.0) if "reach_m" in sights else None,
+        both_ways=_flag(sights, "both_ways", layout.both_ways),
+        redundancy=sights.positive("redundancy", 3.0),
+        cameras=_cameras(root, name),
+        marks=_marks(root.entry("marks"), layout.marks_m),
+        epochs=epochs,
+        interval_s=interval,
+        deformation=deformation,
+        period_s=period,
+        temperature=temperature,
+        effects=tuple(_effect(entry, temperature) for entry in root.listed("effects")),
+        links=_links(root.entry("links")),
+        pixel_px=root.entry("noise").only(("pixel_px",)).positive("pixel_px", 0.05),
+    )
+
+
+def _structure(entry: Entry, layout: str) -> dict[str, float]:
+    sizes = LAYOUTS[layout].size
+    for key in entry.table:
+        if key not in sizes:
+            entry.fail(
+                key, f'unknown key "{key}" for layout "{layout}"; {did_you_mean(key, sizes)}'
+            )
+    return {
+        key: _count(entry, key, size) if isinstance(size, int) else entry.positive(key, size)
+        for key, size in sizes.items()
+    }
+
+
+def _cameras(root: Entry, layout: str) -> Cameras:
+    entry = root.entry("cameras").only(
+        ("each", "count", "focal_px", "image_size", "lens", "distortion", "margin_px", "pose")
+    )
+    each = entry.choice("each", ("sight", "sector"), "sight")
+    if "count" in entry and each == "sight" and layout != "station":
+        entry.fail(
+            "count",
+            "a camera for each sight line has no number of its own; drop count or set "
+            'each = "sector"',
+        )
+    sectors = each == "sector" and layout != "station"
+    count = _count(entry, "count", 4 if sectors else 6, 2 if layout == "station" else 1)
+    size = entry.vector("image_size", 2)
+    size = np.array([2448.0, 2048.0]) if size is None else size
+    if not (size == np.round(size)).all() or not (size >= 64).all():
+        entry.fail("image_size", f"{entry.title('image_size')} must be two whole numbers from 64")
+    if sectors and count < 3 and "focal_px" not in entry:
+        entry.fail(
+            "count",
+            f"{count} cameras with a plane image can't look all around; give count = 4, or "
+            "focal_px for less",
+        )
+    # Half the angle of a sector, a tenth wider.
+    wide = 0.5 * size[0] / np.tan(1.1 * np.pi / max(count, 3))
+    focal = entry.positive("focal_px", float(wide) if sectors else LAYOUTS[layout].focal_px)
+    lens = entry.choice("lens", tuple(LENSES), "pinhole")
+    distortion = entry.vector("distortion", LENSES[lens])
+    margin = entry.number("margin_px", 20.0) or 0.0
+    if not 0.0 <= margin < 0.5 * size.min():
+        entry.fail("margin_px", f"{entry.title('margin_px')} is {margin:g}; give 0 or some pixels")
+    return Cameras(
+        each=each,
+        count=count,
+        focal_px=focal,
+        image_size=(int(size[0]), int(size[1])),
+        lens=lens,
+        distortion=np.zeros(LENSES[lens]) if distortion is None else distortion,
+        margin_px=margin,
+        free=entry.choice("pose", ("known", "free"), "known") == "free",
+    )
+
+
+def _marks(entry: Entry, size: float) -> Marks:
+    entry.only(("kind", "count", "size_m", "tilt_deg", "incidence_deg"))
+    kind = entry.choice("kind", ("body", "plate", "plates"), "body")
+    for key in ("tilt_deg", "incidence_deg"):
+        if kind == "body" and key in entry:
+            entry.fail(key, f'a body is seen from all sides; drop {key} or set kind = "plate"')
+    tilt = entry.number("tilt_deg", 0.0) or 0.0
+    incidence = entry.positive("incidence_deg", 65.0)
+    if not abs(tilt) < incidence < 90.0:
+        entry.fail(
+            "tilt_deg" if "tilt_deg" in entry else "incidence_deg",
+            f"plates turned by {tilt:g} degrees that are found up to {incidence:g}: "
+            "tilt_deg must be below incidence_deg, and that below 90",
+        )
+    body = kind == "body"
+    return Marks(
+        kind,
+        # Fewer marks than six leave a pose with two solutions.
+        _count(entry, "count", 16 if body else 4, 6 if body else 3),
+        entry.positive("size_m", size),
+        float(np.radians(tilt)),
+        float(np.radians(incidence)),
+    )
+
+
+def _deformation(root: Entry, epochs: int, interval: float, layout: str):
+    entry = root.entry("deformation").only((*MODES, "period_s"))
+    found = {key: entry.number(key, 0.0) or 0.0 for key in MODES}
+    found = {key: size for key, size in found.items() if size != 0.0}
+    period = entry.positive("period_s", epochs * interval)
+    if "deformation" not in root:
+        return {}, period
+    if not found:
+        entry.fail(None, f"nothing moves; give {', '.join(MODES)} or drop [deformation]")
+    if epochs < 2:
+        entry.fail(None, "one epoch shows no deformation; give time.epochs = 2 or more")
+    if layout == "station":
+        entry.fail(None, 'the station of layout "station" does not deform; drop [deformation]')
+    return found, period
+
+
+def _temperature(root: Entry, observe: str) -> Temperature | None:
+    entry = root.entry("temperature").only(
+        ("mean_degC", "swing_K", "rise_K", "body_lag_s", "bodies", "every_s", "noise_K")
+    )
+    for key in ("temperature", "effects"):
+        if key in root and observe == "links":
+            root.fail(key, f'links have no cameras; drop {key} or set observe = "both"')
+    if "temperature" not in root:
+        return None
+    numbers = {}
+    for key, default in (("mean_degC", 15.0), ("swing_K", 8.0), ("rise_K", 12.0)):
+        numbers[key] = entry.number(key, default)
+    noise = entry.number("noise_K", 0.01) or 0.0
+    if noise < 0.0:
+        entry.fail("noise_K", f"noise_K is {noise:g}; give 0 or a standard deviation in K")
+    # Readings in degrees Celsius outside these limits are taken for mistakes when read.
+    if abs(numbers["mean_degC"]) + abs(numbers["swing_K"]) + abs(numbers["rise_K"]) > 75.0:
+        entry.fail(
+            None, "temperatures beyond -75 and +75 degrees Celsius; give smaller mean, swing, rise"
+        )
+    return Temperature(
+        **numbers,
+        body_lag_s=entry.positive("body_lag_s", 2400.0),
+        bodies=_flag(entry, "bodies", True),
+        every_s=entry.positive("every_s", 300.0),
+        noise_K=noise,
+    )
+
+
+def _effect(entry: Entry, temperature: Temperature | None) -> ThermalEffect:
+    entry.only(("port", "per_K", "driver", "lag_s", "model", "camera"))
+    if temperature is None:
+        entry.fail(None, f"{entry.title()} follows a temperature; add a table [temperature]")
+    entry.needs("per_K", "30e-6")
+    driver = entry.choice("driver", ("body", "ambient"), "body")
+    if driver == "body" and not temperature.bodies:
+        entry.fail(
+            "driver" if "driver" in entry else None,
+            f'{entry.title()} follows the bodies, which are not logged; set driver = "ambient" or '
+            "temperature.bodies = true",
+        )
+    lag = entry.number("lag_s", 0.0) or 0.0
+    if lag < 0.0:
+        entry.fail("lag_s", f"{entry.title('lag_s')} is {lag:g}; give 0 or a time constant in s")
+    return ThermalEffect(
+        port=entry.choice("port", CAMERA_PORTS),
+        per_K=entry.number("per_K") or 0.0,
+        driver=driver,
+        lag_s=lag,
+        model=entry.choice("model", ("known", "free", "hidden"), "hidden"),
+        camera=tuple(entry.names("camera") or ()),
+        entry=entry,
+    )
+
+
+def _links(entry: Entry) -> LinkNoise:
+    entry.only(("sigma_rad", "sigma_m", "turn_factor", "depth_factor"))
+    return LinkNoise(
+        entry.positive("sigma_rad", 5e-5),
+        entry.positive("sigma_m", 2e-4),
+        entry.positive("turn_factor", 1.0),
+        entry.positive("depth_factor", 1.0),
+    )
+
+
+def _count(entry: Entry, key: str, default: int | float, least: int = 1) -> int:
+    """A whole number of at least so many."""
+    value = entry.table.get(key, default)
+    if not isinstance(value, int) or isinstance(value, bool) or value < least:
+        entry.fail(key, f"{entry.title(key)} is {value!r}; it must be a whole number from {least}")
+    return value
+
+
+def _flag(entry: Entry, key: str, default: bool) -> bool:
+    value = entry.table.get(key, default)
+    if not isinstance(value, bool):
+        entry.fail(key, f"{entry.title(key)} is {value!r}; write true or false")
+    return value
