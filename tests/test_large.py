@@ -93,7 +93,7 @@ def test_selected_inverse_is_the_inverse(seed, n, density):
     lower.sort_indices()
     column = np.repeat(np.arange(n), np.diff(lower.indptr))
     diagonal = np.flatnonzero(lower.indices == column)
-    pattern = Pattern(n, lower.indices.astype(int), column, diagonal, (), (), ())
+    pattern = Pattern(n, lower.indices.astype(int), column, diagonal, (), (), (), ())
     values = np.where(np.abs(lower.data) < 1e-200, 0.0, lower.data)
     found = selected_inverse(SparseNormal(pattern, 0.0, np.zeros(n), values))
     live = np.diagonal(full) > 0.0

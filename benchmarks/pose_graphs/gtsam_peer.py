@@ -114,7 +114,7 @@ def read(path: Path) -> Graph:
             poses[int(words[0])] = words[1:]
         elif tag == "EDGE_SE3:QUAT" and len(words) == 30:
             edges.append(words)
-        else:
+        elif tag != "FIX" and not tag.startswith("#"):
             raise ValueError(f"{path.name} line {number}: {tag} with {len(words)} values")
     ids = sorted(poses)
     given = np.array([poses[i] for i in ids], float).reshape(-1, 7)

@@ -4,6 +4,7 @@ A *turn* is a rotation vector (axis times angle, rad). Below a small angle the c
 replaced by their series, with inputs made safe first, so that no derivative is lost to 0/0.
 """
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -46,12 +47,21 @@ def _series(square, divisors):
     return total / divisors[0]
 
 
+@jax.custom_jvp
 def so3_exp(turn: Float[Array, "3"]) -> Float[Array, "3 3"]:
     """Rotation matrix of a turn (Rodrigues 1840)."""
     square = turn @ turn
     a, b, _ = _sine_coefficients(square)
     outer = turn[:, None] * turn[None, :]
     return jnp.eye(3) * (1.0 - b * square) + a * hat(turn) + b * outer
+
+
+@so3_exp.defjvp
+def _(primals, tangents):
+    """exp(w + d) = exp(J(w) d) exp(w): a tenth of the operations of Rodrigues' derivative."""
+    (turn,), (change,) = primals, tangents
+    rotation = so3_exp(turn)
+    return rotation, hat(so3_left_jacobian(turn) @ change) @ rotation
 
 
 def rotate(turn: Float[Array, "3"], vector: Float[Array, "3"]) -> Float[Array, "3"]:
@@ -106,6 +116,7 @@ def rotation_from_quaternion(quaternion: Float[Array, "4"]) -> Float[Array, "3 3
     return (jnp.eye(3) * (w**2 - v @ v) + 2.0 * outer + 2.0 * w * hat(v)) / square
 
 
+@jax.custom_jvp
 def so3_log(rotation: Float[Array, "3 3"]) -> Float[Array, "3"]:
     """Turn of a rotation, of length at most pi.
 
@@ -127,6 +138,18 @@ def so3_log(rotation: Float[Array, "3 3"]) -> Float[Array, "3"]:
         + 105.0 * square**4 / 3456.0
     )
     return jnp.where(small, series, 2.0 * jnp.arctan2(sine, w) / sine) * v
+
+
+@so3_log.defjvp
+def _(primals, tangents):
+    """log(exp(d) R) = log(R) + J^-1(log R) d, for changes that keep R a rotation."""
+    (rotation,), (change,) = primals, tangents
+    turn = so3_log(rotation)
+    skew = change @ rotation.T
+    small = 0.5 * jnp.stack(
+        [skew[2, 1] - skew[1, 2], skew[0, 2] - skew[2, 0], skew[1, 0] - skew[0, 1]]
+    )
+    return turn, so3_left_jacobian_inverse(turn) @ small
 
 
 def so3_left_jacobian(turn: Float[Array, "3"]) -> Float[Array, "3 3"]:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxvm.geometry.poses import pose_from_vector, se3_exp, vector_from_pose
-from jaxvm.network.factors import Factor, LinkFactor
+from jaxvm.network.factors import Factor, LinkFactor, link_pose
 from jaxvm.network.residual import Network, parts_of, rows
 from jaxvm.network.state import State
 from jaxvm.physics.effects import courses
@@ -53,15 +53,11 @@ def drawn(network: Network, state: State, key: PRNGKeyArray, scale: float = 1.0)
     return network
 
 
-@jax.vmap
-def _relative(a: Array, on_a: Array, b: Array, on_b: Array) -> Float[Array, "6"]:
-    """from_from_to of two bodies on their carriers."""
-    poses = [pose_from_vector(vector) for vector in (a, on_a, b, on_b)]
-    return vector_from_pose((poses[0] @ poses[1]).inverse() @ poses[2] @ poses[3])
-
-
 def _true_links(factor: LinkFactor, flat) -> Float[Array, "links 6"]:
-    return _relative(*parts_of(factor, flat))
+    def one(*own):
+        return vector_from_pose(link_pose([pose_from_vector(vector) for vector in own]))
+
+    return jax.vmap(one)(*parts_of(factor, flat))
 
 
 def _measured(true, root, key, scale) -> Float[Array, "links 6"]:

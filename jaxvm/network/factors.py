@@ -6,6 +6,7 @@ after the other; the block Jacobian comes from the same local functions (`jaxvm.
 """
 
 import abc
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -128,11 +129,11 @@ class LinkFactor(Factor):
     """Measured or calibrated relative poses: log(measured^-1 . from^-1 . to), turn then shift.
 
     A node is a body on a carrier (a camera on its station); one that is its own carrier has the
-    identity as its second pose. `root` is a square root of the information: root^T root = C^-1, so
-    that what comes out is whitened already and sigma is one.
+    identity as its second pose. Where all nodes are, tables have no second poses. `root` is a square
+    root of the information, root^T root = C^-1: what comes out is whitened already, sigma is one.
     """
 
-    slots: Int[Array, "observations 24"]
+    slots: Int[Array, "observations slots"]
     sigma: Float[Array, "observations 6"]
     weight: Float[Array, " observations"]
     measured: Float[Array, "observations 6"]
@@ -143,15 +144,19 @@ class LinkFactor(Factor):
 
     @property
     def widths(self):
-        return (6, 6, 6, 6)
+        return (6,) * (self.slots.shape[1] // 6)
 
     def local(self, own, data, ports):
         measured, root = data
-        poses = [pose_from_vector(vector) for vector in own]
-        world_from_a, world_from_b = poses[0] @ poses[1], poses[2] @ poses[3]
-        return root @ se3_log(
-            pose_from_vector(measured).inverse() @ world_from_a.inverse() @ world_from_b
-        )
+        a_from_b = link_pose([pose_from_vector(vector) for vector in own])
+        return root @ se3_log(pose_from_vector(measured).inverse() @ a_from_b)
+
+
+def link_pose(poses: Sequence[Pose]) -> Pose:
+    """a_from_b of (world_from_a, world_from_b), or of carriers and the bodies on them."""
+    if len(poses) == 4:
+        poses = poses[0] @ poses[1], poses[2] @ poses[3]
+    return poses[0].inverse() @ poses[1]
 
 
 class EdgeFactor(Factor):

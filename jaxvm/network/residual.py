@@ -179,10 +179,10 @@ def linearise(
 ) -> Linearised:
     """Each row with its derivatives: by its live slots, and by the ports.
 
-    `live` are the positions along [own slots, amplitudes, constants] that are wanted. Whatever the
-    number of effects, they enter through the ports: one derivative by the ports serves all
-    amplitudes and constants. Without any the tangent is computed when it is asked for, else it is
-    empty.
+    `live` are the positions along [own slots, amplitudes, constants] that are wanted. Reverse mode:
+    a row has one to six components and many slots. Whatever the number of effects, they enter
+    through the ports: one derivative by the ports serves all amplitudes and constants. Without any
+    the tangent is computed when it is asked for, else it is empty.
     """
     layout, n_own = network.layout, factor.slots.shape[1]
     acting = _acting(network, flat, values)
@@ -248,10 +248,7 @@ def _derivatives(factor: Factor, flat, ports, live: tuple[int, ...]):
     if not free and ports is None:
         value = _values(factor, flat, None)
         return value, *(2 * (jnp.zeros((*value.shape, 0)),))
-    # Few components of many parameters: reverse mode; a relative pose of two bodies: forward mode.
-    inputs = sum(part.shape[1] for part in free) + (0 if ports is None else ports.shape[1])
-    jacobian = jax.jacfwd if inputs <= 3 * factor.sigma.shape[1] else jax.jacrev
-    derivative = jax.vmap(jacobian(local, argnums=(0, 1), has_aux=True))
+    derivative = jax.vmap(jax.jacrev(local, argnums=(0, 1), has_aux=True))
     (blocks, by_ports), value = derivative(free, ports, parts, factor.data())
     none = jnp.zeros((*value.shape, 0))
     by_own = jnp.concatenate([none, *blocks], axis=2)[:, :, wanted]

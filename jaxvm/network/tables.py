@@ -199,6 +199,9 @@ class Tables:
         if links is None or len(links.name) == 0:
             return None
         ends = [self._nodes(nodes, links.epoch) for nodes in (links.from_node, links.to_node)]
+        identity = self.layout.slots("identity", np.zeros(1, int))
+        if all((slots[:, 6:] == identity).all() for slots in ends):
+            ends = [slots[:, :6] for slots in ends]
         return LinkFactor(
             slots=jnp.asarray(np.concatenate(ends, axis=1)),
             sigma=jnp.ones((len(links.name), 6)),

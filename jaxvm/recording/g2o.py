@@ -80,18 +80,22 @@ def import_g2o(file: str | Path, mend: bool = False) -> Recording:
 def write_g2o(recording: Recording, file: str | Path) -> None:
     """Write the stations (with their poses) and the links between stations as a g2o file.
 
-    Vertices are numbered as the stations are; the names stand in comments. Links of other bodies
-    have no place in the format.
+    Vertices keep their numbers where all stations are called by one; else they are numbered as they
+    come, with the names in comments. Links of other bodies have no place in the format.
 
     Raises:
         ValueError: a link joins something else than stations, or a station has no pose.
     """
     links, stations = recording.links, recording.model.stations
+    numbered = all(s.name.isdecimal() and str(int(s.name)) == s.name for s in stations)
+    number = [int(s.name) if numbered else i for i, s in enumerate(stations)]
     lines = []
-    for i, station in enumerate(stations):
+    for i, station in zip(number, stations, strict=True):
         if station.pose is None:
             raise ValueError(f'station "{station.name}" has no pose; write an adjusted model')
-        lines.append(f"VERTEX_SE3:QUAT {i} {_words(_numbers(station.pose))} # {station.name}")
+        if not numbered:
+            lines.append(f"# {i} is {station.name}")
+        lines.append(f"VERTEX_SE3:QUAT {i} {_words(_numbers(station.pose))}")
         if "pose" not in station.free:
             lines.append(f"FIX {i}")
     for k in range(0 if links is None else len(links.name)):
@@ -105,7 +109,7 @@ def write_g2o(recording: Recording, file: str | Path) -> None:
         back = np.argsort(_TURN_FIRST)
         information = np.linalg.inv(links.covariance[k])[back][:, back]
         numbers = [*_numbers(links.pose[k]), *information[_UPPER]]
-        lines.append(f"EDGE_SE3:QUAT {a} {b} {_words(numbers)}")
+        lines.append(f"EDGE_SE3:QUAT {number[a]} {number[b]} {_words(numbers)}")
     text = "\n".join(lines) + "\n"
     file = Path(file)
     data = gzip.compress(text.encode(), mtime=0) if file.suffix == ".gz" else text.encode()
@@ -159,7 +163,7 @@ def _vectors(rows: Float[np.ndarray, "n 7"]) -> Float[np.ndarray, "n 6"]:
 
 def _numbers(pose: Float[np.ndarray, "6"]) -> list[float]:
     """x y z qx qy qz qw of (turn, shift)."""
-    return [*pose[3:], *Rotation.from_rotvec(pose[:3]).as_quat(canonical=True)]
+    return [*pose[3:], *Rotation.from_rotvec(np.array(pose[:3])).as_quat(canonical=True)]
 
 
 def _words(numbers) -> str:

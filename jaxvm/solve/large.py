@@ -15,7 +15,7 @@ from jaxtyping import Float
 from jaxvm.network.unknowns import Unknowns
 from jaxvm.solve.gauge import NullDirection, RankDeficiency
 from jaxvm.solve.problem import Problem
-from jaxvm.solve.sparse import Pattern, SparseFactors, SparseNormal, sparse_normal
+from jaxvm.solve.sparse import Pattern, SparseFactors, SparseNormal, sparse_normal, total_cost
 
 _MOST_DAMPING, _LEAST_DAMPING = 1e12, 1e-12
 _UNSEEN = 1e-20
@@ -94,7 +94,16 @@ def minimise_large(
             damping = max(10.0 * damping, _LEAST_DAMPING)
             continue
         step = -factors.solve(normal.gradient)
-        foretold = -float(normal.gradient @ step) - 0.5 * float(step @ normal.mv(step))
+        # step^T H step = -(gradient + damping step)^T step
+        foretold = -0.5 * float(normal.gradient @ step) + 0.5 * damping * float(step @ step)
+        if abs(foretold) <= rtol * normal.cost + atol and damping <= 1.0:
+            # The last step: its cost is wanted, no equations for a further one.
+            cost = total_cost(problem, jnp.asarray(x + step))
+            if cost <= normal.cost:
+                x, accepted = x + step, accepted + 1
+            history.append(min(cost, normal.cost))
+            why = "converged: the cost no longer changes"
+            break
         trial = sparse_normal(problem, normal.pattern, jnp.asarray(x + step))
         gained = normal.cost - trial.cost
         better = np.isfinite(trial.cost) and (not careful or gained > 1e-4 * foretold)

@@ -7,6 +7,8 @@ finds local unknowns by itself. Packets are linearised and multiplied in one com
 keeps no Jacobian; only their small blocks reach the host.
 """
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import cvxopt
@@ -21,8 +23,10 @@ from jaxvm.network.residual import linearise
 from jaxvm.physics.effects import course_slopes, courses
 from jaxvm.solve.problem import Packets, Problem, flat_state, whitened
 
-_ROWS_AT_A_TIME = 2048
+_ROWS_AT_A_TIME = 256
 """Rows that are linearised together: their Jacobian stays in the processor's cache."""
+
+_CORES = os.cpu_count() or 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,14 +39,17 @@ class Pattern:
         n: number of unknowns.
         row, column: of each non-zero.
         diagonal: place of each diagonal entry among the non-zeros.
-        source, place: for each table, which entries of its flattened blocks count, and where.
-        unknown: for each table, the unknown of each gradient entry of its packets.
+        shares: the packets of all tables in equal shares, one for each core.
+        source, place: for each share and table, which entries of its flattened blocks count, and
+            where.
+        unknown: for each share and table, the unknown of each gradient entry of its packets.
     """
 
     n: int
     row: Int[np.ndarray, " nonzeros"]
     column: Int[np.ndarray, " nonzeros"]
     diagonal: Int[np.ndarray, " n"]
+    shares: tuple[tuple[Packets, ...], ...]
     source: tuple[Int[np.ndarray, " entries"], ...]
     place: tuple[Int[np.ndarray, " entries"], ...]
     unknown: tuple[Int[np.ndarray, " entries"], ...]
@@ -51,8 +58,10 @@ class Pattern:
     def of(cls, problem: Problem) -> "Pattern":
         """Pattern of a problem's normal equations."""
         n = problem.n
+        shares = _shares(problem.packets, n)
+        every_packets = [packets for share in shares for packets in share]
         sources, keys = [], []
-        for packets in problem.packets:
+        for packets in every_packets:
             columns = np.asarray(packets.columns)
             k = columns.shape[1]
             rows = np.repeat(columns, k, axis=1).ravel()
@@ -69,10 +78,30 @@ class Pattern:
             row=every % n,
             column=every // n,
             diagonal=pieces[-1],
+            shares=shares,
             source=tuple(sources),
             place=tuple(pieces[:-1]),
-            unknown=tuple(np.asarray(packets.columns).ravel() for packets in problem.packets),
+            unknown=tuple(np.asarray(packets.columns).ravel() for packets in every_packets),
         )
+
+
+def _shares(tables: tuple[Packets, ...], n: int) -> tuple[tuple[Packets, ...], ...]:
+    """Packets in equal shares for all cores: a share is one compiled program.
+
+    Tables whose packets can't be shared out evenly are filled up with empty packets.
+    """
+
+    def part(packets: Packets, k: int) -> Packets:
+        height = -(-packets.rows.shape[0] // _CORES)
+        rows, columns = np.asarray(packets.rows), np.asarray(packets.columns)
+        spare = height * _CORES - len(rows)
+        # An empty packet has rows past the last one, and unknowns, too.
+        rows = np.pad(rows, ((0, spare), (0, 0)), constant_values=np.iinfo(np.int64).max)
+        columns = np.pad(columns, ((0, spare), (0, 0)), constant_values=n)
+        own = slice(k * height, (k + 1) * height)
+        return Packets(jnp.asarray(rows[own]), jnp.asarray(columns[own]), packets.live)
+
+    return tuple(tuple(part(packets, k) for packets in tables) for k in range(_CORES))
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,19 +132,36 @@ class SparseNormal:
 
 def sparse_normal(problem: Problem, pattern: Pattern, x: Float[Array, " n"]) -> SparseNormal:
     """Normal equations of a problem at x, with the weights of its robust loss."""
-    cost, blocks, products = _products(problem, jnp.asarray(x))
+    x = jnp.asarray(x)
+    bare = eqx.tree_at(lambda p: p.packets, problem, ())
+    with ThreadPoolExecutor(len(pattern.shares)) as pool:
+        parts = list(
+            pool.map(lambda share: jax.block_until_ready(_products(bare, share, x)), pattern.shares)
+        )
+    blocks = [block for _, found, _ in parts for block in found]
+    products = [product for *_, found in parts for product in found]
     values = np.zeros(len(pattern.row))
     gradient = np.zeros(pattern.n + 1)
     tables = zip(pattern.source, pattern.place, pattern.unknown, blocks, products, strict=True)
     for source, place, unknown, block, product in tables:
         values += np.bincount(place, np.ravel(block)[source], len(values))
         gradient += np.bincount(unknown, np.ravel(product), len(gradient))
-    return SparseNormal(pattern, float(cost), gradient[:-1], values)
+    return SparseNormal(pattern, sum(float(cost) for cost, *_ in parts), gradient[:-1], values)
+
+
+def total_cost(problem: Problem, x: Float[Array, " n"]) -> float:
+    """Half the sum of the losses at x."""
+    return float(_cost(eqx.tree_at(lambda p: p.packets, problem, ()), x))
 
 
 @eqx.filter_jit
-def _products(problem: Problem, x):
-    """Cost, and J^T J and J^T r of every packet of every table."""
+def _cost(problem: Problem, x):
+    return problem.cost(x)
+
+
+@eqx.filter_jit
+def _products(problem: Problem, packets_of: tuple[Packets, ...], x):
+    """Cost, and J^T J and J^T r of some packets of every table."""
     network, layout = problem.network, problem.network.layout
     flat, per_parameter = flat_state(problem, x)
     constant = flat[layout.offset("constant") : layout.offset("identity")]
@@ -139,7 +185,7 @@ def _products(problem: Problem, x):
         return cost, left.T @ left, left.T @ jnp.ravel(table.value * root)
 
     cost, blocks, products = jnp.zeros(()), [], []
-    for factor, packets in zip(network.factors(), problem.packets, strict=True):
+    for factor, packets in zip(network.factors(), packets_of, strict=True):
         width = packets.rows.shape[1]
         found = jax.lax.map(
             lambda rows, f=factor, p=packets: of_packet(rows, f, p),
