@@ -5,6 +5,7 @@ OpenCV's order with 0, 4, 5, 8, 12 or 14 coefficients, Kannala-Brandt (2006) as 
 """
 
 import abc
+from functools import cache
 
 import equinox as eqx
 import jax
@@ -196,6 +197,7 @@ LENS_NAMES = ("pinhole", "opencv4", "opencv5", "opencv8", "opencv12", "opencv14"
 """Names of lenses in a recording."""
 
 
+@cache
 def lens_family(name: str) -> LensFamily:
     """Family of a lens by name; ValueError naming the known ones otherwise."""
     if name not in LENS_NAMES:

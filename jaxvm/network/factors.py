@@ -129,8 +129,8 @@ class LinkFactor(Factor):
     """Measured or calibrated relative poses: log(measured^-1 . from^-1 . to), turn then shift.
 
     A node is a body on a carrier (a camera on its station); one that is its own carrier has the
-    identity as its second pose. Where all nodes are, tables have no second poses. `root` is a square
-    root of the information, root^T root = C^-1: what comes out is whitened already, sigma is one.
+    identity as its second pose. Where all nodes are, tables have no second poses. `root` is a
+    square root of the information, root^T root = C^-1: what comes out is whitened, sigma is one.
     """
 
     slots: Int[Array, "observations slots"]

@@ -16,6 +16,7 @@ from jaxvm.geometry.lenses import lens_family
 from jaxvm.network.graph import PoseGraph
 from jaxvm.network.scene import Scene
 from jaxvm.network.views import View, pose_of_view, rays_of_pixels
+from jaxvm.recording import uncorrelated
 
 Key = tuple[str, int]
 
@@ -50,6 +51,15 @@ def matrix(vector) -> Float[np.ndarray, "4 4"]:
     return pose
 
 
+def matrices(vectors) -> Float[np.ndarray, "n 4 4"]:
+    """4 x 4 matrices of many poses (turn, shift)."""
+    vectors = np.array(vectors, float).reshape(-1, 6)
+    poses = np.tile(np.eye(4), (len(vectors), 1, 1))
+    poses[:, :3, :3] = Rotation.from_rotvec(vectors[:, :3]).as_matrix()
+    poses[:, :3, 3] = vectors[:, 3:]
+    return poses
+
+
 def vector(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6"]:
     """(turn, shift) of a 4 x 4 matrix."""
     return np.concatenate([Rotation.from_matrix(pose[:3, :3]).as_rotvec(), pose[:3, 3]])
@@ -62,36 +72,41 @@ def view_relations(scene: Scene, views: list[View]) -> list[Relation]:
     """
     focal, centre = np.asarray(scene.state.focal), np.asarray(scene.state.centre)
     distortion = np.asarray(scene.state.distortion)
-    of_camera: dict[int, list[View]] = defaultdict(list)
+    of_lens: dict[str, list[View]] = defaultdict(list)
     for view in views:
-        of_camera[view.camera].append(view)
-    relations = []
-    for camera, own in of_camera.items():
-        family = lens_family(scene.model.cameras[camera].lens)
+        of_lens[scene.model.cameras[view.camera].lens].append(view)
+    seen, poses, sigmas = [], [], []
+    for lens, own in of_lens.items():
+        sizes = [len(view.pixels) for view in own]
+        camera = np.repeat([view.camera for view in own], sizes)
         rays = rays_of_pixels(
-            family, focal[camera], centre[camera], distortion[camera],
+            lens_family(lens), focal[camera], centre[camera], distortion[camera],
             np.concatenate([view.pixels for view in own]),
         )  # fmt: skip
-        cuts = np.cumsum([len(view.pixels) for view in own])[:-1]
-        for view, of_view in zip(own, np.split(rays, cuts), strict=True):
+        for view, of_view in zip(own, np.split(rays, np.cumsum(sizes)[:-1]), strict=True):
             sound = np.isfinite(of_view).all(axis=1)
             if sound.sum() < 4:
                 continue
             found = pose_of_view(view.points[sound], of_view[sound])
             if found is None:
                 continue
-            sigma = found[1] / np.sqrt(len(of_view)) + 1e-12
-            length = float(np.linalg.norm(found[0][3:])) + 1e-12
-            relations.append(
-                Relation(
-                    keys(scene, "camera", camera, view.epoch),
-                    keys(scene, "target", view.target, view.epoch),
-                    matrix(found[0]),
-                    np.diag(np.repeat([sigma, sigma * length], 3) ** 2),
-                    "view",
-                )
-            )
-    return relations
+            seen.append(view)
+            poses.append(found[0])
+            sigmas.append(found[1] / np.sqrt(len(of_view)) + 1e-12)
+    length = np.linalg.norm(np.reshape(poses, (-1, 6))[:, 3:], axis=1) + 1e-12
+    sigma = np.array(sigmas)
+    return [
+        Relation(
+            keys(scene, "camera", view.camera, view.epoch),
+            keys(scene, "target", view.target, view.epoch),
+            pose,
+            covariance,
+            "view",
+        )
+        for view, pose, covariance in zip(
+            seen, matrices(poses), uncorrelated(sigma, sigma * length), strict=True
+        )
+    ]
 
 
 def link_relations(scene: Scene) -> list[Relation]:
@@ -99,12 +114,12 @@ def link_relations(scene: Scene) -> list[Relation]:
     links = scene.recording.links
     if links is None:
         return []
-    epoch = np.maximum(links.epoch, 0)
+    epoch, pose = np.maximum(links.epoch, 0), matrices(links.pose)
     return [
         Relation(
             keys(scene, *links.from_node[i], epoch[i]),
             keys(scene, *links.to_node[i], epoch[i]),
-            matrix(links.pose[i]),
+            pose[i],
             links.covariance[i],
             links.name[i],
         )
@@ -129,21 +144,23 @@ def held_poses(scene: Scene, given: bool = True) -> dict[Key, Float[np.ndarray, 
     known = {}
     model = scene.model
 
+    mounted = matrices(scene.state.station_from_camera)
+
     def counts(body) -> bool:
         return "pose" not in body.free or (given and body.pose is not None)
 
     for i, camera in enumerate(model.cameras):
         if counts(camera):
-            known["camera", i] = matrix(np.asarray(scene.state.station_from_camera[i]))
+            known["camera", i] = mounted[i]
     for kind, bodies, rows, table in (
         ("station", model.stations, scene.station_row, scene.state.world_from_station),
         ("target", model.targets, scene.target_row, scene.state.carrier_from_target),
     ):
-        values = np.asarray(table)
+        values = matrices(table)
         for i, body in enumerate(bodies):
             if counts(body):
                 for row in np.unique(rows[i]):
-                    known[kind, row] = matrix(values[row])
+                    known[kind, int(row)] = values[row]
     return known
 
 

@@ -37,10 +37,10 @@ class StartError(ValueError):
     """The data don't give start values; the message says for what and why."""
 
 
-Start = Literal["given", "chordal", "best"]
+Start = Literal["auto", "given", "chordal", "best"]
 
 
-def start(scene: Scene, poses: Start = "given") -> Scene:
+def start(scene: Scene, poses: Start = "auto") -> Scene:
     """The scene at start values computed from its data.
 
     Args:
@@ -48,7 +48,9 @@ def start(scene: Scene, poses: Start = "given") -> Scene:
         poses: "given" keeps the poses that the model gives and finds the others along chains of
             views and links; "chordal" finds all free poses from all views and links together
             (`jaxvm.network.chordal`), whatever the model gives; "best" tries both, and the latter
-            with and without weights against gross errors, and keeps what fits best.
+            with and without weights against gross errors, and keeps what fits best. "auto" is
+            "given" but for relay networks (links, or targets on stations): there it is "best"
+            where the model gives start values, and "chordal" where it doesn't.
 
     Raises:
         StartError: a camera without known intrinsics sees no target well enough, or a body can't
@@ -57,6 +59,8 @@ def start(scene: Scene, poses: Start = "given") -> Scene:
     views = collect_views(scene.recording)
     scene = _start_intrinsics(scene, views)
     relations = view_relations(scene, views) + link_relations(scene)
+    if poses == "auto":
+        poses = _usual(scene)
     if poses == "given":
         return _placed(scene, _chain(scene, relations, held_poses(scene)))
     rounds = (0,) if poses == "chordal" else (0, _ROUNDS)
@@ -67,6 +71,16 @@ def start(scene: Scene, poses: Start = "given") -> Scene:
         found.append(_placed(scene, _chain(scene, relations, held_poses(scene))))
         found.sort(key=_misfit)
     return found[0]
+
+
+def _usual(scene: Scene) -> Start:
+    """What suits a scene: errors pile up along the chains of a relay network."""
+    model = scene.model
+    if scene.recording.links is None and not any(t.station for t in model.targets):
+        return "given"
+    bodies = (*model.stations, *model.targets, *model.cameras)
+    guessed = any("pose" in body.free and body.pose is not None for body in bodies)
+    return "best" if guessed else "chordal"
 
 
 def _placed(scene: Scene, known: dict[Key, np.ndarray]) -> Scene:

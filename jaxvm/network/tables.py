@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
@@ -37,25 +38,40 @@ class Tables:
         self.station_row = scene.station_row
         self.target_row = scene.target_row
         self.first_point = scene.first_point
-        names = [s.name for s in self.model.stations]
-        self.station_of = np.array([names.index(c.station) for c in self.model.cameras], int)
-        self.station_of_finder = np.array(
-            [names.index(r.station) for r in self.model.rangefinders], int
-        )
+        places = scene.station_places
+        self.station_of = np.array([places[c.station] for c in self.model.cameras], int)
+        self.station_of_finder = np.array([places[r.station] for r in self.model.rangefinders], int)
+
+    @cached_property
+    def _extent(self) -> tuple[np.ndarray, np.ndarray]:
+        """Middle and half size of all targets (m)."""
         # A target whose marks are unknown has no middle and no size yet.
         points = [
             t.points if np.isfinite(t.points).all() else np.zeros((1, 3))
             for t in self.model.targets
         ]
-        self.centre = np.array([(p.min(0) + p.max(0)) / 2 for p in points])
-        half = np.array([np.ptp(p, axis=0)[:2] / 2 for p in points])
-        self.half_size = np.where(half > 0, half, 1.0)
-        self.checker = np.concatenate(
-            [np.zeros(0), *(checker(t.points) for t in self.model.targets)]
-        )
-        self.along_beam = along_beam(
-            self.station_of, np.asarray(scene.state.station_from_camera)[:, 3:]
-        )
+        low, high = (np.array([end(p, axis=0) for p in points]) for end in (np.min, np.max))
+        half = 0.5 * (high - low)[:, :2]
+        return 0.5 * (low + high), np.where(half > 0, half, 1.0)
+
+    @cached_property
+    def _checker(self) -> np.ndarray:
+        """+1 and -1 in turn over the marks of grids, one target after the other."""
+        # Many targets of a network are alike.
+        known: dict[bytes, np.ndarray] = {}
+        parts = [np.zeros(0)]
+        for target in self.model.targets:
+            key = target.points.tobytes()
+            if key not in known:
+                known[key] = checker(target.points)
+            parts.append(known[key])
+        return np.concatenate(parts)
+
+    @cached_property
+    def along_beam(self) -> np.ndarray:
+        """Place of each camera along the beam of its station."""
+        mounted = np.asarray(self.scene.state.station_from_camera)
+        return along_beam(self.station_of, mounted[:, 3:])
 
     def circumstances(self, epoch, target, point, pixel, height, along_beam) -> Circumstances:
         velocity = np.zeros((len(epoch), 6))
@@ -68,9 +84,9 @@ class Tables:
                 (
                     pixel,
                     height,
-                    self.centre[target],
-                    self.half_size[target],
-                    self.checker[point],
+                    self._extent[0][target],
+                    self._extent[1][target],
+                    self._checker[point],
                     point.astype(float),
                     epoch.astype(float),
                     along_beam,
@@ -290,7 +306,11 @@ def along_beam(
     the outermost ones. NaN where a station has one camera, or all in one place.
     """
     found = np.full(len(station), np.nan)
-    for own in (station == k for k in np.unique(station)):
+    order = np.argsort(station, kind="stable")
+    _, first = np.unique(station[order], return_index=True)
+    for own in np.split(order, first[1:]):
+        if len(own) < 2:
+            continue
         apart = place[own] - place[own].mean(axis=0)
         along = apart @ np.linalg.svd(apart)[2][0]
         if np.ptp(along) > 0.0:

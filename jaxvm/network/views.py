@@ -59,18 +59,21 @@ def collect_views(recording: Recording) -> list[View]:
 def rays_of_pixels(
     family: LensFamily, focal: np.ndarray, centre: np.ndarray, distortion: np.ndarray, pixels
 ) -> np.ndarray:
-    """Unit-z rays (camera frame) of many pixels through a lens."""
+    """Unit-z rays (camera frame) of many pixels through a lens, or through one lens for each."""
     image_points = (np.asarray(pixels) - centre) / focal
-    coefficients = jnp.asarray(distortion[: family.n_coefficients])
     n = len(image_points)
-    padded = np.concatenate([image_points, np.zeros((rounded(n) - n, 2))])
-    rays = np.asarray(_undistort(family, coefficients, jnp.asarray(padded)))[:n]
+    coefficients = np.broadcast_to(
+        np.asarray(distortion)[..., : family.n_coefficients], (n, family.n_coefficients)
+    )
+    spare = ((0, rounded(n) - n), (0, 0))
+    padded = np.pad(image_points, spare), np.pad(coefficients, spare, mode="edge" if n else "empty")
+    rays = np.asarray(_undistort(family, *map(jnp.asarray, padded)))[:n]
     return rays / rays[:, 2:]
 
 
 @eqx.filter_jit
-def _undistort(family, coefficients, image_points):
-    return jax.vmap(lambda p: family.undistort(coefficients, p))(image_points)
+def _undistort(family, image_points, coefficients):
+    return jax.vmap(lambda p, c: family.undistort(c, p))(image_points, coefficients)
 
 
 def pose_of_view(points: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, float] | None:

@@ -26,11 +26,12 @@ def check_recording(recording: Recording, table: Table) -> None:
 def _pixels(recording: Recording, table: Table) -> None:
     obs, model = recording.observations, recording.model
     size = np.array([c.image_size for c in model.cameras], float)
+    largest, count = np.zeros(len(model.cameras)), np.bincount(obs.camera, minlength=len(size))
+    np.maximum.at(largest, obs.camera, np.abs(obs.pixel).max(axis=1))
     for i, camera in enumerate(model.cameras):
-        own = obs.camera == i
-        if own.sum() > 3 and np.abs(obs.pixel[own]).max() <= 2.0:
+        if count[i] > 3 and largest[i] <= 2.0:
             raise table.error(
-                int(np.flatnonzero(own)[0]),
+                int(np.flatnonzero(obs.camera == i)[0]),
                 f'u and v of camera "{camera.name}" are all below 2, which look like normalised '
                 "coordinates; give pixels",
             )
@@ -68,15 +69,17 @@ def _unused(recording: Recording, table: Table) -> None:
     linked = set()
     if recording.links is not None:
         linked = {*recording.links.from_node, *recording.links.to_node}
+    seen = set(np.unique(obs.target).tolist())
     for i, target in enumerate(model.targets):
-        if i not in obs.target and i not in ranged and ("target", i) not in linked:
+        if i not in seen and i not in ranged and ("target", i) not in linked:
             raise table.error(
                 None,
                 f'target "{target.name}" is never seen; add its observations or drop '
                 f"[targets.{target.name}] from recording.toml",
             )
+    using = set(np.unique(obs.camera).tolist())
     for i, camera in enumerate(model.cameras):
-        if i not in obs.camera and ("camera", i) not in linked:
+        if i not in using and ("camera", i) not in linked:
             raise table.error(
                 None,
                 f'camera "{camera.name}" has no observation; add some or drop '
@@ -105,13 +108,13 @@ def _too_few(recording: Recording, table: Table) -> None:
                     f'target "{target.name}" shows {marks[scarce[0]]} of its points{when}, '
                     "but its pose needs at least 3; add points or drop these rows",
                 )
+    count = np.bincount(obs.camera, minlength=len(model.cameras))
     for i, camera in enumerate(model.cameras):
-        own = np.flatnonzero(obs.camera == i)
         width = sum(_NUMBERS.get(name, 0) for name in camera.free)
-        if len(own) and 2 * len(own) < width:
+        if count[i] and 2 * count[i] < width:
             raise table.error(
-                int(own[0]),
-                f'camera "{camera.name}" has {len(own)} observations for {width} free numbers; '
+                int(np.flatnonzero(obs.camera == i)[0]),
+                f'camera "{camera.name}" has {count[i]} observations for {width} free numbers; '
                 "add observations or take fewer names into free",
             )
 

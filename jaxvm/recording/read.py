@@ -109,7 +109,8 @@ def _epochs(table: Table, model: Model):
     table.needs(("epoch",), ("t", *rates))
     ids = table.whole("epoch", "a whole number")
     table.check(
-        np.array([np.flatnonzero(ids == e)[0] == i for i, e in enumerate(ids)]),
+        np.unique(ids, return_index=True)[1][np.unique(ids, return_inverse=True)[1].ravel()]
+        == np.arange(len(ids)),
         lambda row: f"epoch {ids[row]} is there twice; number every epoch once",
     )
     timed = "t" in table.frame
@@ -286,6 +287,7 @@ def _links(table: Table | None, model: Model, ids: np.ndarray) -> Links | None:
         "station": [s.name for s in model.stations],
         "target": [t.name for t in model.targets],
     }
+    place = {kind: {name: i for i, name in enumerate(names)} for kind, names in bodies.items()}
     nodes = {}
     for column in ("from", "to"):
         nodes[column] = []
@@ -295,13 +297,13 @@ def _links(table: Table | None, model: Model, ids: np.ndarray) -> Links | None:
                 raise table.error(
                     row, f'{column} is "{text}"; write camera:NAME, station:NAME or target:NAME'
                 )
-            if name not in bodies[kind]:
+            if name not in place[kind]:
                 raise table.error(
                     row,
                     f'{column}: there is no {kind} "{name}" {has(bodies[kind])}; '
                     f"{did_you_mean(name, bodies[kind])}",
                 )
-            nodes[column].append((kind, bodies[kind].index(name)))
+            nodes[column].append((kind, place[kind][name]))
     covariance = _covariances(table) if full else _of_sigmas(table)
     pose = np.stack([table.numbers(c, "a number (rad or m)") for c in _POSE], axis=1)
     turn = np.linalg.norm(pose[:, :3], axis=1)
