@@ -118,8 +118,18 @@ def _parser() -> argparse.ArgumentParser:
     adjust.add_argument("--out", type=Path, default=None, metavar="DIR")
     adjust.add_argument(
         "--method",
-        choices=("levenberg-marquardt", "gauss-newton"),
+        choices=("levenberg-marquardt", "gauss-newton", "spgd", "lbfgs"),
         default="levenberg-marquardt",
+    )
+    adjust.add_argument(
+        "--start",
+        choices=("auto", "given", "chordal", "best"),
+        default="auto",
+        help="start values of poses: those given and chains from them, all relations together, "
+        "or whichever fits best",
+    )
+    adjust.add_argument(
+        "--snoop", action="store_true", help="set aside links with gross errors, and name them"
     )
     adjust.add_argument(
         "--loss", choices=("squared", "huber", "cauchy", "tukey"), default="squared"
@@ -165,13 +175,28 @@ def _parser() -> argparse.ArgumentParser:
         "--strength", type=float, default=None, help="deformation: factor on every effect"
     )
 
+    montecarlo = command(
+        "montecarlo", _montecarlo, "adjust a simulated network many times: errors against theory"
+    )
+    montecarlo.add_argument("scene", help="as for simulate: an example by its name, or a TOML")
+    montecarlo.add_argument("--trials", type=_natural, default=1000)
+    montecarlo.add_argument("--batch", type=_natural, default=128, help="trials at a time")
+    montecarlo.add_argument("--seed", type=_natural, default=0, help="of the noise")
+    montecarlo.add_argument("--out", type=Path, default=None, metavar="DIR")
+
     convert = command("convert", _convert, "make a recording of other programs' files")
     convert.add_argument(
         "source",
         help="table of corners (.csv), mrcal's corners (.vnl) or .cameramodel, OpenCV's "
-        "calibration (.yml, .xml), the folder of a recording, or the name of a public one",
+        "calibration (.yml, .xml), a pose graph (.g2o, .g2o.gz), the folder of a recording, or the "
+        "name of a public one",
     )
-    convert.add_argument("--out", type=Path, required=True, metavar="RECORDING")
+    convert.add_argument(
+        "--out", type=Path, required=True, metavar="RECORDING", help="a folder, or a .g2o file"
+    )
+    convert.add_argument(
+        "--mend", action="store_true", help="g2o: mend information that is not positive definite"
+    )
     convert.add_argument("--table", choices=("csv", "parquet"), default="csv")
     convert.add_argument("--image-size", type=_size, default=None, metavar="WxH")
     convert.add_argument("--spacing", type=float, default=None, metavar="METRES")
@@ -224,7 +249,10 @@ def _progress(options) -> Callable[[str], None]:
 def _open(name: str, model: Path | None = None):
     """The recording that a command is about: a folder, or a public one by name."""
     from jaxvm.recording import DATASETS, open_recording, read_recording
+    from jaxvm.recording.g2o import import_g2o
 
+    if name.endswith((".g2o", ".g2o.gz")):
+        return import_g2o(name)
     if name in DATASETS and not Path(name).exists():
         return open_recording(name, model)
     return read_recording(name, model)
@@ -295,40 +323,66 @@ def _diagnose_one(options, name: str, out: Path):
 def _adjust(options):
     from jaxvm.network.estimate import estimated_model, pose_table
     from jaxvm.network.scene import build
-    from jaxvm.network.start import start
+    from jaxvm.network.start import is_network, start
     from jaxvm.recording import model_text
     from jaxvm.recording.files import write_files
+    from jaxvm.report.network import write_network_page
     from jaxvm.solve.adjust import adjust, pixel_rms
     from jaxvm.solve.compiling import keep_compiled
     from jaxvm.solve.covariance import standard_deviations
+    from jaxvm.solve.optimise import METHODS
     from jaxvm.solve.robust import LOSSES
+    from jaxvm.solve.snooping import snoop_links
 
     keep_compiled()
     progress = _progress(options)
     progress("start values from the data")
-    scene = start(build(_open(options.recording, options.model)))
+    scene = start(build(_open(options.recording, options.model)), options.start)
     progress("adjustment")
-    result = adjust(scene, options.method, LOSSES[options.loss]())
-    deviations = standard_deviations(result, result.variance_factor)
+    rejected = []
+    if options.snoop:
+        if options.method not in METHODS or options.loss != "squared":
+            raise ValueError("--snoop goes with --method levenberg-marquardt or gauss-newton alone")
+        result, rejected, _ = snoop_links(scene, method=options.method)
+    else:
+        result = adjust(scene, options.method, LOSSES[options.loss]())
+    residuals = result.residuals()
     answer = {
         "cost_before": result.cost_before,
         "cost": result.cost,
         "variance_factor": result.variance_factor,
         "degrees_of_freedom": result.degrees_of_freedom,
-        "pixel_rms_px": pixel_rms(result.scene, result.residuals()),
+        "pixel_rms_px": pixel_rms(result.scene, residuals) if residuals.pixels else None,
         "evaluations": result.evaluations,
         "why": result.why,
         "seconds": result.seconds,
+        "rejected": [{"where": r.where, "test": r.test} for r in rejected],
     }
     text = result.summary()
+    for r in rejected:
+        text += f"\nset aside          {r.where} (test {r.test:.1f})"
     if options.out is not None:
+        progress("precision")
+        deviations = standard_deviations(result, result.variance_factor)
         files = {
             "adjustment.json": json.dumps(answer, indent=1) + "\n",
             "model.toml": model_text(estimated_model(result.scene)),
             "poses.csv": pose_table(result.scene, deviations).to_csv(index=False),
         }
         write_files(options.out, files)
-        text += f"\nwritten            {options.out}: {', '.join(files)}"
+        names = list(files)
+        if is_network(result.scene):
+            progress("the picture of the network")
+            links = result.scene.recording.links
+            page = write_network_page(
+                result,
+                options.out,
+                [links.name[r.row] for r in rejected] if links is not None else (),
+                method=options.method,
+                scale=result.variance_factor,
+            )
+            names.append(page.name)
+        text += f"\nwritten            {options.out}: {', '.join(names)}"
     return answer, text
 
 
@@ -411,6 +465,66 @@ def _simulate_network(options):
     return answer, f"written    {options.out}: {told}\ntruth      {truth}"
 
 
+def _montecarlo(options):
+    import jax
+    import numpy as np
+
+    from jaxvm.network.scene import build
+    from jaxvm.recording.files import write_files
+    from jaxvm.scenes import read_description, simulate_network
+    from jaxvm.solve.compiling import keep_compiled
+    from jaxvm.solve.montecarlo import station_trials
+
+    keep_compiled()
+    progress = _progress(options)
+    made = simulate_network(read_description(options.scene), noise=0.0)
+    scene = build(made.recording)
+    scene = scene.with_state(made.truth.state(scene))
+    world = None
+    if made.truth.hidden:
+        world = build(made.recording, made.truth.effects)
+        world = world.with_state(made.truth.state(world))
+    found, frame = station_trials(
+        scene,
+        jax.random.key(options.seed),
+        options.trials,
+        options.batch,
+        lambda done: progress(f"{done} of {options.trials} trials"),
+        world,
+    )
+    ratio = np.asarray(frame["measured"]) / np.asarray(frame["predicted"])
+    spread = {
+        "least": float(ratio.min()),
+        "median": float(np.median(ratio)),
+        "largest": float(ratio.max()),
+    }
+    answer = {
+        "trials": options.trials,
+        "failed": int(found.failed.sum()),
+        "chi_square": found.chi_square,
+        "variance_factor": float((2.0 * found.cost / found.degrees_of_freedom).mean()),
+        "measured_over_predicted": spread,
+        "hidden": list(made.truth.hidden),
+    }
+    text = "\n".join(
+        [
+            f"trials             {options.trials}, of which failed {answer['failed']}",
+            f"variance factor    {answer['variance_factor']:.4f}",
+            f"chi-square         {found.chi_square:.4f} of the errors, 1 where theory is right",
+            "measured/predicted {least:.3f} to {largest:.3f}, median {median:.3f}".format(**spread),
+            *([f"hidden             {', '.join(made.truth.hidden)}"] if made.truth.hidden else []),
+        ]
+    )
+    if options.out is not None:
+        files = {
+            "montecarlo.json": json.dumps(answer, indent=1) + "\n",
+            "montecarlo.csv": frame.to_csv(index=False),
+        }
+        write_files(options.out, files)
+        text += f"\nwritten            {options.out}: {', '.join(files)}"
+    return answer, text
+
+
 def _convert(options):
     from jaxvm.recording import convert
 
@@ -423,6 +537,7 @@ def _convert(options):
         rows=options.rows,
         columns=options.columns,
         lens=options.lens,
+        mend=options.mend,
     )
     return {"recording": str(options.out), "contents": told}, f"written    {options.out}: {told}"
 

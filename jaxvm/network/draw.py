@@ -53,6 +53,21 @@ def drawn(network: Network, state: State, key: PRNGKeyArray, scale: float = 1.0)
     return network
 
 
+def with_measurements(network: Network, other: Network) -> Network:
+    """The network with what another one of the same tables has measured."""
+    pixels = tuple(
+        eqx.tree_at(lambda f: f.circumstances.pixel, own, its.circumstances.pixel)
+        for own, its in zip(network.pixels, other.pixels, strict=True)
+    )
+    network = replace(network, pixels=pixels)
+    for name in ("ranges", "links", "edges"):
+        own, its = getattr(network, name), getattr(other, name)
+        if own is not None:
+            measured = eqx.tree_at(lambda f: f.measured, own, its.measured)
+            network = replace(network, **{name: measured})
+    return network
+
+
 def _true_links(factor: LinkFactor, flat) -> Float[Array, "links 6"]:
     def one(*own):
         return vector_from_pose(link_pose([pose_from_vector(vector) for vector in own]))

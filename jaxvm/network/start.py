@@ -73,10 +73,16 @@ def start(scene: Scene, poses: Start = "auto") -> Scene:
     return found[0]
 
 
+def is_network(scene: Scene) -> bool:
+    """Whether stations are joined by links, or by targets that they carry."""
+    linked = scene.recording.links is not None
+    return linked or any(target.station for target in scene.model.targets)
+
+
 def _usual(scene: Scene) -> Start:
     """What suits a scene: errors pile up along the chains of a relay network."""
     model = scene.model
-    if scene.recording.links is None and not any(t.station for t in model.targets):
+    if not is_network(scene):
         return "given"
     bodies = (*model.stations, *model.targets, *model.cameras)
     guessed = any("pose" in body.free and body.pose is not None for body in bodies)

@@ -8,6 +8,7 @@ import tomli_w
 from jaxvm.recording.datasets import DATASETS, open_recording
 from jaxvm.recording.errors import RecordingError
 from jaxvm.recording.files import new_folder
+from jaxvm.recording.g2o import import_g2o, write_g2o
 from jaxvm.recording.importers import (
     import_cameramodel,
     import_corner_table,
@@ -29,13 +30,16 @@ def convert(
     rows: int | None = None,
     columns: int | None = None,
     lens: str = "opencv8",
+    mend: bool = False,
 ) -> str:
     """Write a recording made of `source`; returns a sentence that tells what is in it.
 
     What the source is follows from its name: .csv is a table of corners, .vnl mrcal's corners,
     .cameramodel mrcal's optimisation inputs, a folder a recording, and the name of a public
     recording that one. OpenCV's calibration (.yml, .yaml, .xml) has no observations: `out` gets a
-    recording.toml with its cameras, to which targets and tables are to be added.
+    recording.toml with its cameras, to which targets and tables are to be added. A pose graph
+    (.g2o, .g2o.gz) becomes stations and links, with `mend` where its information is not positive
+    definite; where `out` is such a file, stations and links become a pose graph.
 
     Raises:
         RecordingError: the source is wrong, or needs a number that was not given.
@@ -71,13 +75,18 @@ def convert(
             {"camera": needed(image_size, "the image size")},
             lens=lens,
         )
+    elif path.name.endswith((".g2o", ".g2o.gz")):
+        recording = import_g2o(path, mend)
     elif kind == ".cameramodel":
         recording = import_cameramodel(path)
     else:
         raise RecordingError(
             f"{source}: it is no folder, no public recording ({', '.join(DATASETS)}), and no .csv, "
-            ".vnl, .cameramodel, .yml or .xml file; mend the name"
+            ".vnl, .cameramodel, .g2o, .yml or .xml file; mend the name"
         )
+    if Path(out).name.endswith((".g2o", ".g2o.gz")):
+        write_g2o(recording, out)
+        return describe(recording)
     write_recording(recording, out, table)
     return describe(recording)
 

@@ -4,7 +4,7 @@ import base64
 import json
 from pathlib import Path
 
-from jinja2 import Environment, PackageLoader, select_autoescape
+from jinja2 import Environment, PackageLoader
 
 from jaxvm import __version__
 from jaxvm.discover.diagnosis import Diagnosis
@@ -50,7 +50,7 @@ def write_report(diagnosis: Diagnosis, folder: str | Path, data_only: bool = Fal
 def html(diagnosis: Diagnosis, pictures: dict[str, bytes]) -> str:
     """The page, with its pictures inside."""
     environment = Environment(
-        loader=PackageLoader("jaxvm.report"), autoescape=select_autoescape(), trim_blocks=True
+        loader=PackageLoader("jaxvm.report"), autoescape=True, trim_blocks=True
     )
     encoded = {
         name.removesuffix(".png"): "data:image/png;base64," + base64.b64encode(data).decode()

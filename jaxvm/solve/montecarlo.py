@@ -11,10 +11,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from scipy.stats import chi2
 
-from jaxvm.network.draw import drawn
+from jaxvm.network.draw import drawn, with_measurements
 from jaxvm.network.scene import Scene
 from jaxvm.network.state import State
 from jaxvm.solve.arrow import factorise
@@ -79,6 +80,7 @@ def montecarlo(
     trials: int = 1000,
     batch: int = 128,
     progress: Callable[[int], None] | None = None,
+    world: Scene | None = None,
 ) -> MonteCarlo:
     """Adjust a scene many times, its measurements drawn about its present state.
 
@@ -86,6 +88,8 @@ def montecarlo(
 
     Args:
         scene: at the true state; its sigmas are those of the noise.
+        world: the same recording with physics that the model leaves out, at the true state:
+            measurements are drawn from it. By default the model leaves out nothing.
         quantity: of the state, whose errors count; differentiable.
         key: of the noise; trial k is the same whatever the number of trials and the batch.
         trials: how many.
@@ -105,9 +109,10 @@ def montecarlo(
     problem, normal = scaled(problem, normal_at(problem, jnp.zeros(problem.n)))
     check_gauge(normal, scene.unknowns)
     keys = jax.vmap(lambda k: jax.random.fold_in(key, k))(jnp.arange(-(-trials // batch) * batch))
+    source = None if world is None else (world.network, world.state)
     parts = []
     for first in range(0, trials, batch):
-        found = _trials(problem, quantity, keys[first : first + batch])
+        found = _trials(problem, quantity, keys[first : first + batch], source)
         parts.append(jax.tree.map(np.asarray, found))
         if progress is not None:
             progress(min(first + batch, trials))
@@ -124,14 +129,60 @@ def montecarlo(
     )
 
 
+def station_trials(
+    scene: Scene,
+    key: PRNGKeyArray,
+    trials: int = 1000,
+    batch: int = 128,
+    progress: Callable[[int], None] | None = None,
+    world: Scene | None = None,
+) -> tuple[MonteCarlo, pd.DataFrame]:
+    """Monte Carlo of the poses of all stations that are free, and a table of it.
+
+    The table has a row for every station and epoch and each part of its pose: error foretold,
+    measured and the 95 % interval of the latter (rad, m), and the mean error. Arguments as for
+    `montecarlo`.
+
+    Raises:
+        ValueError: no station is free.
+    """
+    rows, labels = [], []
+    ids = scene.recording.epoch_ids
+    for i, station in enumerate(scene.model.stations):
+        if "pose" not in station.free:
+            continue
+        own, first = np.unique(scene.station_row[i], return_index=True)
+        moving = station.motion == "per-epoch"
+        rows += own.tolist()
+        labels += [(station.name, str(ids[k]) if moving else "") for k in first]
+    if not rows:
+        raise ValueError("no station is free: there is nothing to adjust")
+    at = jnp.asarray(rows)
+    found = montecarlo(
+        scene, lambda s: s.world_from_station[at], key, trials, batch, progress, world
+    )
+    low, high = found.interval()
+    parts = [f"{part}_{axis}" for part in ("turn", "shift") for axis in "xyz"]
+    frame = pd.DataFrame(
+        [(*label, part) for label in labels for part in parts],
+        columns=["station", "epoch", "part"],
+    )
+    frame["predicted"], frame["measured"] = found.predicted, found.measured
+    frame["low"], frame["high"] = low, high
+    frame["mean"] = found.errors.mean(axis=0) if len(found.errors) else np.nan
+    return found, frame
+
+
 @eqx.filter_jit
-def _trials(problem: Problem, quantity: Quantity, keys):
+def _trials(problem: Problem, quantity: Quantity, keys, source):
     """Errors, costs, and whether each trial converged."""
     truth = problem.state(jnp.zeros(problem.n))
     aim = jnp.ravel(quantity(truth))
+    network, state = (problem.network, truth) if source is None else source
 
     def one(key):
-        own = eqx.tree_at(lambda p: p.network, problem, drawn(problem.network, truth, key))
+        measured = with_measurements(problem.network, drawn(network, state, key))
+        own = eqx.tree_at(lambda p: p.network, problem, measured)
 
         def step(state):
             x, _, k = state
