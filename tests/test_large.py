@@ -14,16 +14,26 @@ from scipy.sparse import csc_array
 from scipy.stats import chi2
 
 from jaxvm.network.chordal import chordal_poses
-from jaxvm.network.graph import PoseGraph, UnconnectedNetwork
+from jaxvm.network.cycles import fundamental_cycles
+from jaxvm.network.graph import (
+    PoseGraph,
+    UnconnectedNetwork,
+    breadth_first_tree,
+    chain_poses,
+)
+from jaxvm.network.relations import held_poses, link_relations, pose_graph
 from jaxvm.network.scene import build
 from jaxvm.network.start import start
+from jaxvm.physics.effects import Effect, Term
+from jaxvm.scenes import parse_description, simulate_network
 from jaxvm.solve import adjust as adjusting
 from jaxvm.solve import covariance as covariances
 from jaxvm.solve import large, snooping
 from jaxvm.solve.adjust import adjust
+from jaxvm.solve.condition import adjust_conditions
 from jaxvm.solve.covariance import covariance, pose_covariances, standard_deviations
 from jaxvm.solve.gauge import RankDeficiency
-from jaxvm.solve.montecarlo import montecarlo
+from jaxvm.solve.montecarlo import montecarlo, station_trials
 from jaxvm.solve.problem import normal_at, scene_problem
 from jaxvm.solve.robust import HuberLoss
 from jaxvm.solve.selected import SelectedInverse, selected_inverse
@@ -278,3 +288,59 @@ def test_monte_carlo_does_not_depend_on_the_batch(known):
         for batch in (7, 40)
     ]
     assert np.allclose(some[0].errors, some[1].errors, rtol=1e-6, atol=1e-10)
+
+
+def test_conditions_and_the_network_residual_agree():
+    """The same scene by cycles with dense matrices, and by all poses at once: to 1e-9."""
+    known = network(seed=5)
+    scene = build(known.recording)
+    graph, _ = pose_graph(scene, link_relations(scene), held_poses(scene, given=False))
+    cycles = fundamental_cycles(graph)
+    by_cycles = adjust_conditions(graph, cycles)
+    adjusted = replace(graph, pose=np.asarray(by_cycles.pose))
+    # All ways lead to the same poses now: one tree is enough.
+    poses = chain_poses(adjusted, np.zeros((1, 6)), breadth_first_tree(adjusted, np.zeros(1, int)))
+    found = adjust(scene, "gauss-newton", rtol=1e-15)
+    assert by_cycles.squares == pytest.approx(2.0 * found.cost, rel=1e-9)
+    assert by_cycles.redundancy == found.degrees_of_freedom == 6 * len(cycles)
+    stations = zip(scene.model.stations[1:], found.scene.state.world_from_station[1:], strict=True)
+    for station, pose in stations:
+        ours = poses[graph.names.index(f'station "{station.name}"')]
+        assert np.allclose(matrix(ours), matrix(pose), atol=1e-9)
+
+
+@pytest.mark.parametrize("method, rel", [("lbfgs", 1e-6), ("spgd", 0.02)])
+def test_descents_reach_the_same_minimum(known, method, rel):
+    scene = build(known.recording)
+    best = adjust(scene, "gauss-newton").cost
+    found = adjust(start(scene, "chordal"), method)
+    assert best <= found.cost < (1.0 + rel) * best
+    assert len(found.evaluations_at) == len(found.history)
+    assert found.history[-1] == pytest.approx(found.cost)
+
+
+def test_an_unknown_method_is_named(known):
+    with pytest.raises(ValueError, match='no method "newton".*spgd, lbfgs'):
+        adjust(build(known.recording), "newton")
+
+
+def test_hidden_physics_shows_in_monte_carlo():
+    """Measurements drawn from a world with a longer lens than the model believes."""
+    description = parse_description('layout = "chain"\nstations = 4')
+    made = simulate_network(description, noise=0.0)
+    scene = build(made.recording)
+    scene = scene.with_state(made.truth.state(scene))
+    effect = Effect("longer", (Term("sensor.focal"),), amplitudes=(5e-4,))
+    world = build(made.recording, (effect,))
+    true = made.truth.state(world)
+    world = world.with_state(eqx.tree_at(lambda s: s.amplitude, true, jnp.full(1, 5e-4)))
+    key = jax.random.key(3)
+    plain, frame = station_trials(scene, key, 200, 100)
+    hidden, _ = station_trials(scene, key, 200, 100, world=world)
+    assert list(frame.columns[:3]) == ["station", "epoch", "part"]
+    assert len(frame) == 6 * 3
+    assert plain.chi_square == pytest.approx(1.0, abs=0.15)
+    assert hidden.chi_square > 1.5 * plain.chi_square
+    # A longer lens brings everything nearer: the error is no noise.
+    bias = np.abs(hidden.errors.mean(axis=0)) / (hidden.predicted / np.sqrt(200))
+    assert bias.max() > 10.0

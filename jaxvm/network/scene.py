@@ -18,7 +18,6 @@ from jaxvm.network.residual import Network
 from jaxvm.network.state import N_DISTORTION, Layout, State
 from jaxvm.network.tables import Tables
 from jaxvm.network.unknowns import Unknowns, free_unknowns
-from jaxvm.physics.drivers import build_channels
 from jaxvm.physics.effects import Effect, capacity, tabulate
 from jaxvm.recording import Recording
 
@@ -140,15 +139,7 @@ def build(recording: Recording, effects: tuple[Effect, ...] | None = None) -> Sc
     first_point = np.concatenate([[0], np.cumsum(counts)]).astype(int)
     state = _given_state(recording, station_row, target_row)
     layout = Layout.of(state)
-    channels = build_channels(
-        recording.time,
-        {} if recording.drivers is None else recording.drivers.channels,
-        None if recording.drivers is None else recording.drivers.time,
-        {c.name: c.powered_on_s for c in model.cameras if c.powered_on_s},
-        recording.timed,
-        recording.time[list(recording.starts)],
-        tuple(camera.name for camera in model.cameras),
-    )
+    channels = recording.channels()
     empty, _, _ = tabulate((), channels, 0, 1)
     nothing = np.zeros(0, int)
     scene = Scene(

@@ -120,9 +120,7 @@ def _too_few(recording: Recording, table: Table) -> None:
 
 
 def _effects(recording: Recording) -> None:
-    known = {"constant", "time" if recording.timed else "order"}
-    known |= set() if recording.drivers is None else set(recording.drivers.channels)
-    known |= {f"time since power-on of {c.name}" for c in recording.model.cameras if c.powered_on_s}
+    known = recording.channels().names
     for effect in recording.model.effects:
         if effect.driver not in known:
             raise RecordingError(

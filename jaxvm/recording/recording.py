@@ -5,6 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxvm.physics.drivers import build_channels
+from jaxvm.physics.effects import Channels
 from jaxvm.recording.model import Model
 
 
@@ -108,6 +110,19 @@ class Recording:
     links: Links | None = None
     timed: bool = True
     starts: tuple[int, ...] = (0,)
+
+    def channels(self) -> Channels:
+        """What effects may follow in time: the recorded channels, and those made of them."""
+        model = self.model
+        return build_channels(
+            self.time,
+            {} if self.drivers is None else self.drivers.channels,
+            None if self.drivers is None else self.drivers.time,
+            {c.name: c.powered_on_s for c in model.cameras if c.powered_on_s},
+            self.timed,
+            self.time[list(self.starts)],
+            tuple(camera.name for camera in model.cameras),
+        )
 
     def select_epochs(self, mask: Bool[np.ndarray, " epochs"]) -> "Recording":
         """The same recording with the epochs where `mask` is true.
