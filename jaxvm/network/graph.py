@@ -8,6 +8,8 @@ from jaxtyping import Float, Int
 from rustworkx.visit import BFSVisitor, DijkstraVisitor
 from scipy.spatial.transform import Rotation
 
+from jaxvm.geometry.matrices import adjoint_of_inverse, matrices, vector
+
 Walk = list[tuple[int, int]]
 """Edges walked one after the other, each with +1 (from its from to its to) or -1 (backward)."""
 
@@ -283,42 +285,19 @@ def compose(
         return np.zeros(6), np.zeros((6, 6))
     edges, signs = np.array(walk, int).T
     behind, levers = np.eye(4), np.zeros((len(edges), 4, 4))
-    steps = _matrices(graph.pose[edges])
+    steps = matrices(graph.pose[edges])
     for k in reversed(range(len(edges))):
         if signs[k] > 0:
             levers[k], behind = behind, steps[k] @ behind
         else:
-            levers[k] = behind = _inverse(steps[k]) @ behind
+            levers[k] = behind = np.linalg.inv(steps[k]) @ behind
     used, place = np.unique(edges, return_inverse=True)
     jacobian = np.zeros((len(used), 6, 6))
-    np.add.at(jacobian, place, signs[:, None, None] * _adjoint_of_inverse(levers))
+    np.add.at(jacobian, place, signs[:, None, None] * adjoint_of_inverse(levers))
     covariance = np.einsum(
         "kij,kjl,kml->im", jacobian, graph.covariance[used], jacobian, optimize=True
     )
-    turn = Rotation.from_matrix(behind[:3, :3]).as_rotvec()
-    return np.concatenate([turn, behind[:3, 3]]), covariance
-
-
-def _matrices(poses: Float[np.ndarray, "many 6"]) -> Float[np.ndarray, "many 4 4"]:
-    out = np.tile(np.eye(4), (len(poses), 1, 1))
-    out[:, :3, :3], out[:, :3, 3] = Rotation.from_rotvec(poses[:, :3]).as_matrix(), poses[:, 3:]
-    return out
-
-
-def _inverse(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    out = np.eye(4)
-    out[:3, :3], out[:3, 3] = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]
-    return out
-
-
-def _adjoint_of_inverse(poses: Float[np.ndarray, "many 4 4"]) -> Float[np.ndarray, "many 6 6"]:
-    """Ad(P)^-1 = [R^T, 0; -R^T hat(t), R^T], for twists (turn, shift)."""
-    back = np.swapaxes(poses[:, :3, :3], 1, 2)
-    out = np.zeros((len(poses), 6, 6))
-    out[:, :3, :3] = out[:, 3:, 3:] = back
-    # Column j of -hat(t) is e_j x t.
-    out[:, 3:, :3] = back @ np.cross(np.eye(3), poses[:, None, :3, 3]).swapaxes(1, 2)
-    return out
+    return vector(behind), covariance
 
 
 def _costs(graph: PoseGraph, weight: Float[np.ndarray, " edges"] | None) -> list[float]:

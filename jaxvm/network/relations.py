@@ -10,15 +10,18 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from jaxvm.geometry.lenses import lens_family
+from jaxvm.geometry.matrices import adjoint_of_inverse, matrices, vector
 from jaxvm.network.graph import PoseGraph
 from jaxvm.network.scene import Scene
 from jaxvm.network.views import View, pose_of_view, rays_of_pixels
 from jaxvm.recording import uncorrelated
 
 Key = tuple[str, int]
+
+_EXACT = 1e-6
+"""Standard deviation (rad) of the turn of a view without noise: finite weights against links'."""
 
 
 class Relation(NamedTuple):
@@ -41,28 +44,6 @@ class Relation(NamedTuple):
     def error(self) -> float:
         """Largest standard deviation of the turn (rad)."""
         return float(np.sqrt(np.diagonal(self.covariance)[:3].max()))
-
-
-def matrix(vector) -> Float[np.ndarray, "4 4"]:
-    """4 x 4 matrix of a pose (turn, shift)."""
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_rotvec(np.array(vector[:3])).as_matrix()
-    pose[:3, 3] = vector[3:]
-    return pose
-
-
-def matrices(vectors) -> Float[np.ndarray, "n 4 4"]:
-    """4 x 4 matrices of many poses (turn, shift)."""
-    vectors = np.array(vectors, float).reshape(-1, 6)
-    poses = np.tile(np.eye(4), (len(vectors), 1, 1))
-    poses[:, :3, :3] = Rotation.from_rotvec(vectors[:, :3]).as_matrix()
-    poses[:, :3, 3] = vectors[:, 3:]
-    return poses
-
-
-def vector(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6"]:
-    """(turn, shift) of a 4 x 4 matrix."""
-    return np.concatenate([Rotation.from_matrix(pose[:3, :3]).as_rotvec(), pose[:3, 3]])
 
 
 def view_relations(scene: Scene, views: list[View]) -> list[Relation]:
@@ -92,8 +73,8 @@ def view_relations(scene: Scene, views: list[View]) -> list[Relation]:
                 continue
             seen.append(view)
             poses.append(found[0])
-            sigmas.append(found[1] / np.sqrt(len(of_view)) + 1e-12)
-    length = np.linalg.norm(np.reshape(poses, (-1, 6))[:, 3:], axis=1) + 1e-12
+            sigmas.append(found[1] / np.sqrt(len(of_view)) + _EXACT)
+    length = np.linalg.norm(np.reshape(poses, (-1, 6))[:, 3:], axis=1)
     sigma = np.array(sigmas)
     return [
         Relation(
@@ -194,7 +175,7 @@ def pose_graph(
         if found is None:
             continue
         ends, measured, right = found
-        carry = _adjoint(np.linalg.inv(right))
+        carry = adjoint_of_inverse(right[None])[0]
         edges.append([number.setdefault(key, len(number)) for key in ends])
         poses.append(vector(measured))
         covariances.append(carry @ relation.covariance @ carry.T)
@@ -245,9 +226,3 @@ def _end(chain: tuple[Key, ...], known: dict[Key, np.ndarray]):
     before = reduce(np.matmul, (known[key] for key in chain[:at]), np.eye(4))
     behind = reduce(np.matmul, (known[key] for key in chain[at + 1 :]), np.eye(4))
     return missing[0], before, behind
-
-
-def _adjoint(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6 6"]:
-    r, t = pose[:3, :3], pose[:3, 3]
-    cross = np.array([[0.0, -t[2], t[1]], [t[2], 0.0, -t[0]], [-t[1], t[0], 0.0]])
-    return np.block([[r, np.zeros((3, 3))], [cross @ r, r]])

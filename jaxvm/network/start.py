@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxvm.geometry.lenses import lens_family
+from jaxvm.geometry.matrices import matrix, vector
 from jaxvm.network.chordal import chordal_poses
 from jaxvm.network.graph import check_connected
 from jaxvm.network.relations import (
@@ -22,10 +23,8 @@ from jaxvm.network.relations import (
     Relation,
     held_poses,
     link_relations,
-    matrix,
     name_of,
     pose_graph,
-    vector,
     view_relations,
 )
 from jaxvm.network.residual import residual

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
+from jaxvm.geometry.matrices import matrix
 from jaxvm.geometry.poses import se3_exp
 from jaxvm.geometry.rotations import so3_left_jacobian, so3_left_jacobian_inverse
 from jaxvm.network.cycles import bridges
@@ -23,7 +24,6 @@ from jaxvm.network.relations import (
     held_poses,
     keys,
     link_relations,
-    matrix,
     pose_graph,
 )
 from jaxvm.network.residual import linearise
