@@ -101,6 +101,8 @@ def _chordal(scene: Scene, relations: list[Relation], rounds: int) -> dict[Key, 
     known = _with_origin(scene, relations, held_poses(scene, given=False))
     graph, keys = pose_graph(scene, relations, known)
     check_connected(graph)
+    if len(graph.edges) == 0:
+        return known
     found = chordal_poses(graph, np.zeros((1, 6)), rounds)
     return known | {key: matrix(pose) for key, pose in zip(keys[1:], found[1:], strict=True)}
 

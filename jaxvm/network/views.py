@@ -95,15 +95,18 @@ def pose_of_view(points: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, floa
 
 def _solve_pnp(points: np.ndarray, image_points: np.ndarray):
     image_points = np.ascontiguousarray(image_points, float)
-    try:
-        ok, turn, shift = cv2.solvePnP(
-            points, image_points, np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP
-        )
-        if ok:
-            turn, shift = cv2.solvePnPRefineLM(points, image_points, np.eye(3), None, turn, shift)
-    except cv2.error:
-        return False, None, None
-    return ok, turn, shift
+    # SQPNP refuses views that look small; the other one needs six marks where they are no plane.
+    for flags in (cv2.SOLVEPNP_SQPNP, cv2.SOLVEPNP_ITERATIVE):
+        try:
+            ok, turn, shift = cv2.solvePnP(points, image_points, np.eye(3), None, flags=flags)
+            if ok:
+                turn, shift = cv2.solvePnPRefineLM(
+                    points, image_points, np.eye(3), None, turn, shift
+                )
+                return True, turn, shift
+        except cv2.error:
+            continue
+    return False, None, None
 
 
 def guess_intrinsics(
