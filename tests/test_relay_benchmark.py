@@ -11,7 +11,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks" / "relay"))
 from doubles import by_link_covariances, pointing  # noqa: E402
 from intervals import gain, rms  # noqa: E402
 from marks import LENGTH, TILTED, double, pictured, relative  # noqa: E402
-from networks import LAYOUTS, layout  # noqa: E402
+from meshes import LAYOUTS, layout  # noqa: E402
 from scipy.sparse import coo_array  # noqa: E402
 from scipy.sparse.csgraph import connected_components  # noqa: E402
 from stations import ideal, pairs_of, realistic  # noqa: E402

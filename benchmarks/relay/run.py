@@ -3,7 +3,7 @@
     python benchmarks/relay/run.py [--quick] [--out DIR] [--only STUDY | --again]
 
 Four studies, each closed form or first-order covariance beside Monte Carlo with 95 % intervals:
-chains (`growing`), relay stations (`stations`), loops and whole networks (`networks`), double
+chains (`growing`), relay stations (`stations`), loops and whole networks (`meshes`), double
 chains (`doubles`). Writes results.json, results.md and four figures beside this file; with --quick
 fewer trials and smaller networks, into `report/` (which git ignores). --only runs one
 study and keeps the others of results.json, --again draws tables and figures from it.
@@ -18,7 +18,7 @@ import contributions
 import doubles
 import growing
 import jax
-import networks
+import meshes
 import stations
 from intervals import RESAMPLES
 
@@ -29,7 +29,7 @@ HERE = Path(__file__).parent
 FULL = {
     "chains": lambda: growing.study(20, 20_000),
     "stations": lambda: stations.study(12, 1000, 5),
-    "networks": lambda: networks.study(
+    "networks": lambda: meshes.study(
         {"ring with chords": 24, "ladder": 30, "grid": 36, "random": 48},
         (3, 4, 8, 16, 32), 1000, 2,
     ),
@@ -39,21 +39,21 @@ FULL = {
 QUICK = {
     "chains": lambda: growing.study(10, 500),
     "stations": lambda: stations.study(4, 200, 1),
-    "networks": lambda: networks.study({"ladder": 8, "random": 12}, (3,), 200, 1),
+    "networks": lambda: meshes.study({"ladder": 8, "random": 12}, (3,), 200, 1),
     "doubles": lambda: doubles.study(200, 5),
 }
 
 TABLES = {
     "chains": ("Chains: errors along n links of 10 m", growing.table),
     "stations": ("Relay stations: gain over the plain pairs", stations.table),
-    "networks": ("Loops and networks", networks.table),
+    "networks": ("Loops and networks", meshes.table),
     "doubles": ("The double chain, 10 links of 10 m", contributions.table),
 }
 
 FIGURES = {
     "chains": growing.figure,
     "stations": stations.figure,
-    "networks": networks.figure,
+    "networks": meshes.figure,
     "doubles": contributions.figure,
 }
 
