@@ -179,8 +179,8 @@ def _parser() -> argparse.ArgumentParser:
         "montecarlo", _montecarlo, "adjust a simulated network many times: errors against theory"
     )
     montecarlo.add_argument("scene", help="as for simulate: an example by its name, or a TOML")
-    montecarlo.add_argument("--trials", type=_natural, default=1000)
-    montecarlo.add_argument("--batch", type=_natural, default=128, help="trials at a time")
+    montecarlo.add_argument("--trials", type=_positive, default=1000)
+    montecarlo.add_argument("--batch", type=_positive, default=128, help="trials at a time")
     montecarlo.add_argument("--seed", type=_natural, default=0, help="of the noise")
     montecarlo.add_argument("--out", type=Path, default=None, metavar="DIR")
 
@@ -227,6 +227,13 @@ def _natural(text: str) -> int:
     return value
 
 
+def _positive(text: str) -> int:
+    value = _natural(text)
+    if value == 0:
+        raise argparse.ArgumentTypeError("it must be at least 1")
+    return value
+
+
 def _size(text: str) -> tuple[int, int]:
     width, _, height = text.partition("x")
     if not (width.isdecimal() and height.isdecimal()):
@@ -252,6 +259,8 @@ def _open(name: str, model: Path | None = None):
     from jaxvm.recording.g2o import import_g2o
 
     if name.endswith((".g2o", ".g2o.gz")):
+        if model is not None:
+            raise ValueError(f"--model goes with a folder; convert {name} to one first")
         return import_g2o(name)
     if name in DATASETS and not Path(name).exists():
         return open_recording(name, model)

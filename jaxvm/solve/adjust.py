@@ -230,48 +230,59 @@ def _adjusted(
     if check:
         check_gauge(normal, scene.unknowns)
     if method in DESCENTS:
-        freedom = degrees_of_freedom(problem, normal.hessian.diagonal())
-        return _descended(scene, problem, DESCENTS[method](problem, max_steps), freedom)
+        return _descended(scene, problem, normal.hessian.diagonal(), method, max_steps)
     solver = METHODS[method](
         jnp.asarray(rtol), limit=jnp.asarray(max_steps), damping=jnp.asarray(damping)
     )
     x, last = minimise(problem, normal, solver)
     history = np.asarray(last.history)
-    history = history[~np.isnan(history)]
-    state = _state(problem, x)
-    why = _why(last, max_steps)
+    return _result(
+        scene,
+        problem,
+        x,
+        normal.hessian.diagonal(),
+        history[~np.isnan(history)],
+        int(last.evaluations),
+        int(last.accepted),
+        _why(last, max_steps),
+    )
+
+
+def _result(
+    scene: Scene, problem: Problem, x, diagonal, history, evaluations, accepted, why, at=None
+) -> Adjustment:
+    """What a minimisation found, whatever the method; the caller knows how long it took."""
     return Adjustment(
-        scene=scene.with_state(state),
+        scene=scene.with_state(_state(problem, x)),
         problem=problem,
         x=x,
         cost_before=float(history[0]) if len(history) else float("nan"),
         cost=float(history[-1]) if len(history) else float("nan"),
-        degrees_of_freedom=degrees_of_freedom(problem, normal.hessian.diagonal()),
-        evaluations=int(last.evaluations),
-        accepted=int(last.accepted),
+        degrees_of_freedom=degrees_of_freedom(problem, diagonal),
+        evaluations=evaluations,
+        accepted=accepted,
         history=history,
         why=why,
         seconds=0.0,
         seconds_compiling=0.0,
+        evaluations_at=at,
     )
 
 
-def _descended(scene: Scene, problem: Problem, found: Descent, freedom: int) -> Adjustment:
+def _descended(scene: Scene, problem: Problem, diagonal, method: str, max_steps) -> Adjustment:
     """The adjustment by a method that knows costs (and gradients) alone."""
-    return Adjustment(
-        scene=scene.with_state(_state(problem, found.x)),
-        problem=problem,
-        x=found.x,
-        cost_before=float(found.history[0]),
-        cost=found.cost,
-        degrees_of_freedom=freedom,
-        evaluations=found.evaluations,
-        accepted=found.evaluations,
-        history=found.history,
-        why=found.why,
-        seconds=0.0,
-        seconds_compiling=0.0,
-        evaluations_at=found.evaluations_at,
+    found = DESCENTS[method](problem, max_steps)
+    count = found.evaluations
+    return _result(
+        scene,
+        problem,
+        found.x,
+        diagonal,
+        found.history,
+        count,
+        count,
+        found.why,
+        found.evaluations_at,
     )
 
 
@@ -285,25 +296,19 @@ def _adjusted_large(
     if check:
         check_large_gauge(problem, normal, factors, scene.unknowns)
     if method in DESCENTS:
-        freedom = degrees_of_freedom(problem, normal.diagonal())
-        return _descended(scene, problem, DESCENTS[method](problem, max_steps), freedom)
+        return _descended(scene, problem, normal.diagonal(), method, max_steps)
     fit = minimise_large(
         problem, normal, factors, method, rtol=rtol, limit=max_steps, damping=damping
     )
-    x = jnp.asarray(fit.x)
-    return Adjustment(
-        scene=scene.with_state(_state(problem, x)),
-        problem=problem,
-        x=x,
-        cost_before=float(fit.history[0]),
-        cost=float(fit.history[-1]),
-        degrees_of_freedom=degrees_of_freedom(problem, normal.diagonal()),
-        evaluations=fit.evaluations,
-        accepted=fit.accepted,
-        history=fit.history,
-        why=fit.why,
-        seconds=0.0,
-        seconds_compiling=0.0,
+    return _result(
+        scene,
+        problem,
+        jnp.asarray(fit.x),
+        normal.diagonal(),
+        fit.history,
+        fit.evaluations,
+        fit.accepted,
+        fit.why,
     )
 
 

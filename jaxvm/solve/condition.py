@@ -26,16 +26,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.linalg import block_diag, cho_factor, cho_solve, solve_triangular
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from jaxvm.geometry import pose_from_vector, se3_exp, vector_from_pose
 from jaxvm.network.factors import ClosureFactor
-from jaxvm.network.graph import PoseGraph
+from jaxvm.network.graph import PoseGraph, Walk, components
 from jaxvm.physics.ports import PortValues
-
-Walk = Sequence[tuple[int, int]]
-"""A closed walk: edges by their place in the graph, 1 where walked as measured, -1 backwards."""
 
 _ITERATIONS = 50
 
@@ -260,16 +255,14 @@ def _path(graph: PoseGraph, walk: Walk) -> str:
 
 
 def _check_held(graph: PoseGraph) -> None:
-    n, (a, b) = len(graph.names), np.reshape(graph.edges, (-1, 2)).T
-    _, part = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(n, n)))
-    _, first, count = np.unique(part[graph.held], return_index=True, return_counts=True)
-    if (count > 1).any():
-        place = part[graph.held[first[np.argmax(count > 1)]]]
-        both = ", ".join(graph.names[i] for i in graph.held if part[i] == place)
-        raise ValueError(
-            f"{both} are held and joined by edges: their known poses are conditions that no cycle "
-            "states; hold one of them, or join them by one more edge of high precision"
-        )
+    for part in components(graph):
+        held = np.intersect1d(graph.held, part)
+        if len(held) > 1:
+            both = ", ".join(graph.names[i] for i in held)
+            raise ValueError(
+                f"{both} are held and joined by edges: their known poses are conditions that no "
+                "cycle states; hold one of them, or join them by one more edge of high precision"
+            )
 
 
 def _check_independent(graph: PoseGraph, cycles: Sequence[Walk]) -> None:

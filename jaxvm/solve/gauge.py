@@ -48,10 +48,10 @@ def null_directions(normal: Normal, unknowns: Unknowns) -> list[NullDirection]:
     for group in np.flatnonzero(np.asarray(eigen_local).min(axis=1, initial=1.0) < SINGULAR):
         own = names[s + group * d : s + (group + 1) * d]
         k = int(np.argmin(eigen_local[group]))
-        found.append(_direction(float(eigen_local[group, k]), vectors_local[group, :, k], own))
+        found.append(named_direction(float(eigen_local[group, k]), vectors_local[group, :, k], own))
     if not found:
         for k in np.flatnonzero(np.asarray(eigen) < SINGULAR):
-            found.append(_direction(float(eigen[k]), vectors[:, k], names[:s]))
+            found.append(named_direction(float(eigen[k]), vectors[:, k], names[:s]))
     return found
 
 
@@ -59,15 +59,21 @@ def check_gauge(normal: Normal, unknowns: Unknowns) -> None:
     """Raise RankDeficiency, naming the unknowns, where the problem is singular."""
     found = null_directions(normal, unknowns)
     if found:
-        what = "; ".join(direction.words() for direction in found[:3])
-        more = f" (and {len(found) - 3} more combinations)" if len(found) > 3 else ""
-        raise RankDeficiency(
-            f"the observations do not determine: {what}{more}; "
-            "hold one of them, add a prior, or record what ties them down"
-        )
+        raise deficiency(found)
 
 
-def _direction(eigenvalue: float, vector, names: list[str]) -> NullDirection:
+def deficiency(found: list[NullDirection]) -> RankDeficiency:
+    """The error that names what the observations don't determine."""
+    what = "; ".join(direction.words() for direction in found[:3])
+    more = f" (and {len(found) - 3} more combinations)" if len(found) > 3 else ""
+    return RankDeficiency(
+        f"the observations do not determine: {what}{more}; "
+        "hold one of them, add a prior, or record what ties them down"
+    )
+
+
+def named_direction(eigenvalue: float, vector, names: list[str]) -> NullDirection:
+    """A null direction with the names and shares of what makes it up."""
     share = np.abs(np.asarray(vector))
     order = np.argsort(-share)
     kept = [(names[i], float(share[i])) for i in order if share[i] > 0.1 * share.max() and names[i]]

@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxvm.network.unknowns import Unknowns
-from jaxvm.solve.gauge import NullDirection, RankDeficiency
-from jaxvm.solve.problem import Problem
+from jaxvm.solve.gauge import RankDeficiency, deficiency, named_direction
+from jaxvm.solve.problem import Problem, to_unit_diagonal
 from jaxvm.solve.sparse import Pattern, SparseFactors, SparseNormal, sparse_normal, total_cost
 
 _MOST_DAMPING, _LEAST_DAMPING = 1e12, 1e-12
@@ -50,10 +50,7 @@ class LargeFit:
 def scaled_large(problem: Problem, pattern: Pattern) -> tuple[Problem, SparseNormal]:
     """The problem with unknowns scaled to a unit diagonal, and its normal equations at x = 0."""
     normal = sparse_normal(problem, pattern, jnp.zeros(problem.n))
-    diagonal = normal.diagonal()
-    scale = np.where(diagonal > 0.0, 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0)), 1.0)
-    per_parameter = np.append(scale, 1.0)[np.asarray(problem.column)]
-    problem = eqx.tree_at(lambda p: p.factor, problem, problem.factor * per_parameter)
+    problem, scale = to_unit_diagonal(problem, normal.diagonal())
     return problem, normal.rescaled(scale)
 
 
@@ -151,17 +148,8 @@ def check_large_gauge(
         vector = np.where(used, factors.solve(vector), 0.0)
         vector /= np.linalg.norm(vector)
     eigenvalue = float(_seen(problem, jnp.asarray(vector)))
-    if eigenvalue > _UNSEEN:
-        return
-    share = np.abs(vector)
-    names = unknowns.names()
-    order = np.argsort(-share)[:60]
-    kept = [(names[i], float(share[i])) for i in order if share[i] > 0.1 * share.max() and names[i]]
-    direction = NullDirection(eigenvalue, tuple(kept))
-    raise RankDeficiency(
-        f"the observations do not determine: {direction.words()}; "
-        "hold one of them, add a prior, or record what ties them down"
-    )
+    if eigenvalue <= _UNSEEN:
+        raise deficiency([named_direction(eigenvalue, vector, unknowns.names())])
 
 
 @eqx.filter_jit

@@ -18,6 +18,7 @@ from scipy.stats import chi2
 from jaxvm.network.draw import drawn, with_measurements
 from jaxvm.network.scene import Scene
 from jaxvm.network.state import State
+from jaxvm.solve.adjust import degrees_of_freedom
 from jaxvm.solve.arrow import factorise
 from jaxvm.solve.gauge import check_gauge
 from jaxvm.solve.large import is_large
@@ -120,14 +121,11 @@ def montecarlo(
         if progress is not None:
             progress(min(first + batch, trials))
     errors, cost, converged = (np.concatenate(part)[:trials] for part in zip(*parts, strict=True))
-    used = sum(
-        int(np.sum(np.asarray(f.weight) > 0)) * f.sigma.shape[1] for f in problem.network.factors()
-    )
     return MonteCarlo(
         errors=errors[converged],
         covariance=np.asarray(_covariance(problem, quantity)),
         cost=cost[converged],
-        degrees_of_freedom=used - int(np.sum(np.asarray(normal.hessian.diagonal()) > 0)),
+        degrees_of_freedom=degrees_of_freedom(problem, normal.hessian.diagonal()),
         failed=~converged,
     )
 

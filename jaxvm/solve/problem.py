@@ -305,11 +305,17 @@ def normal_at(problem: Problem, x: Float[Array, " n"]) -> Normal:
 
 def scaled(problem: Problem, normal: Normal) -> tuple[Problem, Normal]:
     """The problem with unknowns scaled to a unit diagonal, and its normal equations at x = 0."""
-    diagonal = np.asarray(normal.hessian.diagonal())
+    problem, scale = to_unit_diagonal(problem, np.asarray(normal.hessian.diagonal()))
+    return problem, _rescale(normal, jnp.asarray(scale))
+
+
+def to_unit_diagonal(
+    problem: Problem, diagonal: Float[np.ndarray, " n"]
+) -> tuple[Problem, Float[np.ndarray, " n"]]:
+    """The problem with unknowns scaled so that this diagonal is one, and the scales."""
     scale = np.where(diagonal > 0.0, 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0)), 1.0)
     per_parameter = np.append(scale, 1.0)[np.asarray(problem.column)]
-    problem = eqx.tree_at(lambda p: p.factor, problem, problem.factor * per_parameter)
-    return problem, _rescale(normal, jnp.asarray(scale))
+    return eqx.tree_at(lambda p: p.factor, problem, problem.factor * per_parameter), scale
 
 
 @jax.jit

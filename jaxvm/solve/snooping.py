@@ -46,19 +46,19 @@ def redundancy(adjustment: Adjustment) -> tuple[np.ndarray, ...]:
 def _redundancies(problem: Problem, x):
     tables = problem.linearised(x)
     counted = [np.asarray(factor.weight) > 0.0 for factor in problem.network.factors()]
-    hats = _hats(problem, x, tables)
+    hats = _hats(problem, x, tables, tables)
     return [
         used[:, None, None] * np.eye(hat.shape[1]) - hat
         for used, hat in zip(counted, hats, strict=True)
     ]
 
 
-def _hats(problem: Problem, x, tables) -> list[np.ndarray]:
-    """J H^-1 J^T of every observation of linearised tables, H being that of the problem."""
+def _hats(problem: Problem, x, tables, own) -> list[np.ndarray]:
+    """J H^-1 J^T of every observation of linearised tables, H being that of the problem's own."""
     jacobians = [table.jacobian for table in tables]
     if is_large(problem):
         return _large_hats(problem, x, jacobians)
-    hessian = problem.normal(x).hessian
+    hessian = problem.assembled(own).hessian
     return _arrow_hats(hessian, problem.packets, jacobians, problem.sizes)
 
 
@@ -160,7 +160,7 @@ def link_tests(adjustment: Adjustment) -> tuple[Float[np.ndarray, " links"], np.
     # Linearised with all of them in use; the normal equations are those of the adjustment.
     every = eqx.tree_at(lambda p: p.network.links.weight, problem, jnp.ones(len(used)))
     tables = every.linearised(x)
-    hat = np.asarray(_hats(problem, x, tables)[place])
+    hat = np.asarray(_hats(problem, x, tables, problem.linearised(x))[place])
     value, vector = np.linalg.eigh(np.eye(6) + np.where(used[:, None, None], -hat, hat))
     checked = value > _CHECKED
     along = np.einsum("nij,ni->nj", vector, np.asarray(tables[place].value))
