@@ -10,10 +10,12 @@ from dataclasses import replace
 
 import pytest
 from networks import board_recording
+from pose_networks import network
 
 import jaxvm.cli
 from jaxvm.cli import Interruption, main
 from jaxvm.recording import read_recording, write_recording
+from jaxvm.recording.g2o import import_g2o, write_g2o
 from jaxvm.simulate import HIDEABLE
 
 
@@ -138,3 +140,48 @@ def test_interrupted_run_leaves_nothing(board, tmp_path):
     assert run.returncode == 130 and "interrupted" in said
     assert not out.exists()
     assert not [f for f in tmp_path.iterdir() if f.name.startswith(".")]
+
+
+def test_a_pose_graph_goes_in_and_out(tmp_path, capsys, monkeypatch):
+    """A gross error among its links is named; the pictures are written; g2o comes out again."""
+    monkeypatch.setattr(jaxvm.solve.compiling, "keep_compiled", lambda: None)
+    recording = network(seed=2).recording
+    pose = recording.links.pose.copy()
+    pose[7, 3:] += 2.0
+    graph = tmp_path / "graph.g2o"
+    write_g2o(replace(recording, links=replace(recording.links, pose=pose)), graph)
+    folder, out, back = (str(tmp_path / name) for name in ("folder", "out", "back.g2o"))
+    assert main(["convert", str(graph), "--out", folder]) == 0
+    assert main(["convert", folder, "--out", back]) == 0
+    assert len(import_g2o(back).links.name) == len(recording.links.name)
+    capsys.readouterr()
+    assert main(["adjust", folder, "--snoop", "--out", out, "--json", "--quiet"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    name = read_recording(folder).links.name[7]
+    assert [r["where"] for r in told["rejected"]] == [f"link {name}"]
+    assert told["pixel_rms_px"] is None and 0.3 < told["variance_factor"] < 2.0
+    assert {f.name for f in (tmp_path / "out").iterdir()} == {
+        "adjustment.json", "model.toml", "poses.csv", "network.html", "network.json"
+    }  # fmt: skip
+    # Without snooping the error spoils the fit, and a model can't be put in place of a graph's.
+    assert main(["adjust", str(graph), "--json", "--quiet"]) == 0
+    assert json.loads(capsys.readouterr().out)["variance_factor"] > 10.0
+    model = str(tmp_path / "out" / "model.toml")
+    assert main(["adjust", str(graph), "--model", model, "--quiet"]) == 2
+    assert "--model goes with a folder" in capsys.readouterr().err
+
+
+def test_monte_carlo_of_a_described_network(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(jaxvm.solve.compiling, "keep_compiled", lambda: None)
+    scene, out = tmp_path / "scene.toml", tmp_path / "trials"
+    scene.write_text('layout = "ring"\nstations = 4\nobserve = "links"\n')
+    asked = ["montecarlo", str(scene), "--trials", "300", "--batch", "100", "--out", str(out)]
+    assert main([*asked, "--json"]) == 0
+    said = capsys.readouterr()
+    told = json.loads(said.out)
+    assert "200 of 300 trials" in said.err
+    assert told["trials"] == 300 and told["failed"] == 0
+    assert told["chi_square"] == pytest.approx(1.0, abs=4 * (2 / (18 * 300)) ** 0.5)
+    assert len((out / "montecarlo.csv").read_text().splitlines()) == 1 + 6 * 3
+    with pytest.raises(SystemExit):
+        main(["montecarlo", str(scene), "--trials", "0"])

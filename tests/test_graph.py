@@ -11,16 +11,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
-from jaxvm.network.cycles import (
-    bridges,
-    cycle_effects,
-    effective_resistance,
-    fundamental_cycles,
-    minimum_cycle_basis,
-    misclosure,
-    redundancy_numbers,
-    weak_edges,
-)
+from jaxvm.network.cycles import cycle_effects, fundamental_cycles, minimum_cycle_basis, misclosure
 from jaxvm.network.graph import (
     PoseGraph,
     UnconnectedNetwork,
@@ -37,6 +28,7 @@ from jaxvm.network.graph import (
     typical_length,
     unheld_parts,
 )
+from jaxvm.network.redundancy import bridges, effective_resistance, redundancy_numbers, weak_edges
 
 SIGMAS = 5.0
 """Monte Carlo: 36 elements of a covariance stay within this many of their own deviations."""

@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from jaxvm.geometry import pose_from_vector, so3_log
-from jaxvm.network.cycles import effective_resistance, fundamental_cycles
+from jaxvm.network.cycles import fundamental_cycles
 from jaxvm.network.draw import drawn as drawn_network
 from jaxvm.network.graph import (
     PoseGraph,
@@ -35,6 +35,7 @@ from jaxvm.network.graph import (
     n_conditions,
     shortest_path_tree,
 )
+from jaxvm.network.redundancy import effective_resistance
 from jaxvm.network.scene import Scene, build
 from jaxvm.pose.chains import Link, drawn, pose_error
 from jaxvm.pose.relay import adjust_relay

@@ -19,8 +19,9 @@ from intervals import bars, gain, words
 from marks import isotropic, pictured, relative
 from matplotlib.figure import Figure
 
-from jaxvm.network.cycles import effective_resistance, fundamental_cycles
+from jaxvm.network.cycles import fundamental_cycles
 from jaxvm.network.graph import PoseGraph
+from jaxvm.network.redundancy import effective_resistance
 from jaxvm.pose.chains import Link, drawn, pose_error
 from jaxvm.pose.relay import adjust_relay, all_pairs, pair_variance
 from jaxvm.solve.condition import adjust_conditions

@@ -14,14 +14,9 @@ from markupsafe import Markup
 from scipy.stats import chi2
 
 from jaxvm import __version__
-from jaxvm.network.cycles import (
-    HARDLY_CHECKED,
-    WeakEdge,
-    fundamental_cycles,
-    minimum_cycle_basis,
-    misclosure,
-)
+from jaxvm.network.cycles import fundamental_cycles, minimum_cycle_basis, misclosure
 from jaxvm.network.graph import components, n_conditions, shortest_path_tree, unheld_parts
+from jaxvm.network.redundancy import HARDLY_CHECKED, WeakEdge
 from jaxvm.recording.files import write_files
 from jaxvm.report.network_figures import convergence_figure, growth_figures
 from jaxvm.report.network_graph import BodyGraph, body_graph

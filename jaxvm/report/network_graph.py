@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 from jaxvm.geometry.matrices import matrix
 from jaxvm.geometry.poses import se3_exp
 from jaxvm.geometry.rotations import so3_left_jacobian, so3_left_jacobian_inverse
-from jaxvm.network.cycles import bridges
 from jaxvm.network.graph import PoseGraph
+from jaxvm.network.redundancy import bridges
 from jaxvm.network.relations import (
     Key,
     Relation,
