@@ -12,7 +12,8 @@ def matrices(vectors) -> Float[np.ndarray, "n 4 4"]:
     """Matrices of many poses (turn, shift)."""
     vectors = np.array(vectors, float).reshape(-1, 6)
     poses = np.tile(np.eye(4), (len(vectors), 1, 1))
-    poses[:, :3, :3] = Rotation.from_rotvec(vectors[:, :3]).as_matrix()
+    if len(vectors):
+        poses[:, :3, :3] = Rotation.from_rotvec(vectors[:, :3]).as_matrix()
     poses[:, :3, 3] = vectors[:, 3:]
     return poses
 
@@ -24,7 +25,15 @@ def matrix(vector) -> Float[np.ndarray, "4 4"]:
 
 def vector(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6"]:
     """(turn, shift) of a matrix; the turn has length at most pi."""
-    return np.concatenate([Rotation.from_matrix(pose[:3, :3]).as_rotvec(), pose[:3, 3]])
+    return vectors(pose[None])[0]
+
+
+def vectors(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 6"]:
+    """(turn, shift) of many matrices; turns have length at most pi."""
+    turns = np.zeros((0, 3))
+    if len(poses):
+        turns = Rotation.from_matrix(poses[:, :3, :3]).as_rotvec()
+    return np.concatenate([turns, poses[:, :3, 3]], axis=1)
 
 
 def adjoint_of_inverse(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 6 6"]:

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
+from jaxvm.geometry.matrices import matrices, vectors
 from jaxvm.network.binding import bind
 from jaxvm.network.residual import Network
 from jaxvm.network.state import N_DISTORTION, Layout, State
@@ -97,6 +98,27 @@ class Scene:
         turn, own = Rotation.from_rotvec(carrier[:, :3]), Rotation.from_rotvec(pose[:, :3])
         shift = turn.apply(pose[:, 3:]) + carrier[:, 3:]
         return np.concatenate([(turn * own).as_rotvec(), shift], axis=1)
+
+    def camera_from_targets(
+        self,
+        camera: Int[np.ndarray, " n"],
+        target: Int[np.ndarray, " n"],
+        epoch: Int[np.ndarray, " n"],
+    ) -> Float[np.ndarray, "n 6"]:
+        """Present poses of targets before cameras."""
+        station = np.array([self.station_places[c.station] for c in self.model.cameras], int)
+        row = self.station_row[station[camera], epoch]
+        world_from_camera = matrices(np.asarray(self.state.world_from_station)[row]) @ matrices(
+            np.asarray(self.state.station_from_camera)[camera]
+        )
+        world_from_target = matrices(self.world_from_targets(target, epoch))
+        return vectors(np.linalg.inv(world_from_camera) @ world_from_target)
+
+    def view_name(self, camera: int, target: int, epoch: int) -> str:
+        """What is seen in one image, in words."""
+        name = f"{self.model.cameras[camera].name} sees {self.model.targets[target].name}"
+        several = len(self.recording.epoch_ids) > 1
+        return f"{name}, epoch {self.recording.epoch_ids[epoch]}" if several else name
 
     def carrier_rows(
         self, target: Int[np.ndarray, " n"], epoch: Int[np.ndarray, " n"]

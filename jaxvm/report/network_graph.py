@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
-from jaxvm.geometry.matrices import matrix
+from jaxvm.geometry.matrices import matrices, matrix
 from jaxvm.geometry.poses import se3_exp
 from jaxvm.geometry.rotations import so3_left_jacobian, so3_left_jacobian_inverse
 from jaxvm.network.graph import PoseGraph
@@ -103,14 +103,11 @@ class BodyGraph:
     n_poseless: int
 
 
-def body_graph(
-    adjustment: Adjustment, rejected: frozenset[str] = frozenset(), scale: float = 1.0
-) -> BodyGraph:
+def body_graph(adjustment: Adjustment, scale: float = 1.0) -> BodyGraph:
     """The graph of an adjusted scene.
 
     Args:
-        adjustment: of the scene.
-        rejected: names of links that are set aside; links of weight zero are, too.
+        adjustment: of the scene; its links of weight zero are set aside.
         scale: factor on the covariance of the poses: 1 trusts the stated sigmas.
     """
     scene = adjustment.scene
@@ -121,7 +118,7 @@ def body_graph(
 
     blocks = redundancy(adjustment)
     links = link_relations(scene)
-    link_blocks, set_aside = _links(adjustment, blocks, rejected)
+    link_blocks, set_aside = _links(adjustment, blocks)
     test, checked, residual = _link_tests(adjustment, link_blocks)
     sights, views, sight_hat, excess, n_poseless = _sights(adjustment, blocks)
     relations = [nodes.joined(relation) for relation in (*links, *sights)]
@@ -257,14 +254,14 @@ class _Nodes:
         return pose, lever @ spread @ lever.swapaxes(1, 2)
 
 
-def _links(adjustment: Adjustment, blocks, rejected: frozenset[str]):
+def _links(adjustment: Adjustment, blocks):
     """Redundancy matrix of each link, and which are set aside."""
     network, links = adjustment.problem.network, adjustment.scene.recording.links
     if links is None or network.links is None:
         return np.zeros((0, 6, 6)), np.zeros(0, bool)
     aside = np.asarray(network.links.weight)[: len(links.name)] <= 0.0
     of_links = blocks[len(network.pixels) + (network.ranges is not None)]
-    return of_links, aside | np.isin(links.name, list(rejected))
+    return of_links, aside
 
 
 def _link_tests(adjustment: Adjustment, blocks: Float[np.ndarray, "links 6 6"]):
@@ -331,44 +328,18 @@ def _sights(adjustment: Adjustment, blocks):
     twist = -np.einsum("nij,nj->ni", covariance, pull[good])
     views, redundant = views[good], 2.0 * count[good] - hat[good]
     excess = square[good] / np.maximum(redundant, 1e-9)
-    measured = _camera_from_target(scene, views) @ _exponentials(twist)
+    measured = matrices(scene.camera_from_targets(*views.T)) @ _exponentials(twist)
     relations = [
         Relation(
             keys(scene, "camera", int(camera), int(epoch)),
             keys(scene, "target", int(target), int(epoch)),
             measured[k],
             covariance[k],
-            _sight_name(scene, camera, target, epoch),
+            scene.view_name(camera, target, epoch),
         )
         for k, (camera, target, epoch) in enumerate(views)
     ]
     return relations, views, hat[good], excess, n - len(good)
-
-
-def _sight_name(scene: Scene, camera: int, target: int, epoch: int) -> str:
-    name = f"{scene.model.cameras[camera].name} sees {scene.model.targets[target].name}"
-    several = len(scene.recording.epoch_ids) > 1
-    return f"{name}, epoch {scene.recording.epoch_ids[epoch]}" if several else name
-
-
-def _camera_from_target(scene: Scene, views: Int[np.ndarray, "n 3"]) -> np.ndarray:
-    """Adjusted poses of the targets in the cameras that see them, as 4 x 4 matrices."""
-    camera, target, epoch = views.T
-    station = np.array([scene.station_places[c.station] for c in scene.model.cameras], int)
-    rows = scene.station_row[station[camera], epoch] if len(views) else np.zeros(0, int)
-    world_from_camera = _matrices(_values(scene, "station")[rows].reshape(-1, 6)) @ _matrices(
-        _values(scene, "camera")[camera].reshape(-1, 6)
-    )
-    world_from_target = _matrices(scene.world_from_targets(target, epoch).reshape(-1, 6))
-    return np.linalg.inv(world_from_camera) @ world_from_target
-
-
-def _matrices(poses: Float[np.ndarray, "n 6"]) -> Float[np.ndarray, "n 4 4"]:
-    out = np.tile(np.eye(4), (len(poses), 1, 1))
-    if len(poses):
-        out[:, :3, :3] = Rotation.from_rotvec(poses[:, :3]).as_matrix()
-        out[:, :3, 3] = poses[:, 3:]
-    return out
 
 
 def _exponentials(twists: Float[np.ndarray, "n 6"]) -> Float[np.ndarray, "n 4 4"]:
