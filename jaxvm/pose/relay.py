@@ -14,6 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order
@@ -150,19 +151,25 @@ def _adjusted(pairs, tree, links: Link) -> Relay:
 
     def improve(state):
         poses, _, step, _, count = state
-        normal, gradient = _normal(table, pairs, poses)
-        change = _solve(normal, -gradient)
+        slope, value = _linearised(table, pairs, poses)
+        # Turns and shifts differ by many orders of magnitude; the normal matrix would square that,
+        # and again what one link is better than another.
+        scale = 1.0 / jnp.linalg.norm(slope, axis=0)
+        orthogonal, root = jnp.linalg.qr(slope * scale)
+        shorter = orthogonal.T @ value
+        change = -scale * solve_triangular(root, shorter)
         poses = _moved(poses, jnp.concatenate([jnp.zeros(6), change]).reshape(n, 6))
-        return poses, normal, jnp.sqrt(jnp.maximum(-gradient @ change, 0.0)), step, count + 1
+        return poses, root / scale, jnp.linalg.norm(shorter), step, count + 1
 
     far = jnp.asarray(jnp.inf)
     start = (_start(tree, links, n), jnp.eye(6 * (n - 1)), far, far, jnp.asarray(0))
-    # The normal matrix is that before the last step, which is none to speak of.
-    poses, normal, last, _, steps = jax.lax.while_loop(unfinished, improve, start)
+    # The root of the normal matrix is that before the last step, which is none to speak of.
+    poses, root, last, _, steps = jax.lax.while_loop(unfinished, improve, start)
     whitened = jax.vmap(partial(table.local, ports=PortValues()))(
         parts_of(table, _flat(poses)), table.data()
     )
-    covariance = jnp.zeros((6 * n, 6 * n)).at[6:, 6:].set(_solve(normal, jnp.eye(6 * (n - 1))))
+    inverse = solve_triangular(root, jnp.eye(6 * (n - 1)))
+    covariance = jnp.zeros((6 * n, 6 * n)).at[6:, 6:].set(inverse @ inverse.T)
     correction = jnp.einsum("eij,ej->ei", jnp.linalg.cholesky(links.covariance), whitened)
     squares = jnp.sum(whitened**2)
     return Relay(poses, covariance.reshape(n, 6, n, 6), correction, squares, steps, last)
@@ -203,9 +210,9 @@ def _moved(poses, change):
     return jax.vmap(move)(poses, change)
 
 
-def _normal(table: LinkFactor, pairs, poses):
-    """Normal matrix and gradient without the first body."""
-    n = len(poses)
+def _linearised(table: LinkFactor, pairs, poses):
+    """Derivatives by the twists of all bodies but the first, and whitened residuals."""
+    n, links = len(poses), len(pairs)
 
     def local(change, own, data):
         ends = _moved(jnp.stack([own[0], own[2]]), change)
@@ -215,21 +222,11 @@ def _normal(table: LinkFactor, pairs, poses):
     slope, value = jax.vmap(jax.jacfwd(local, has_aux=True), in_axes=(None, 0, 0))(
         jnp.zeros((2, 6)), parts_of(table, _flat(poses)), table.data()
     )
-    blocks = jnp.einsum("eipa,eiqb->epqab", slope, slope)
-    a, b = pairs[:, :, None], pairs[:, None, :]
-    normal = jnp.zeros((n, n, 6, 6)).at[a, b].add(blocks).transpose(0, 2, 1, 3)
-    gradient = jnp.zeros((n, 6)).at[pairs].add(jnp.einsum("eipa,ei->epa", slope, value))
-    return normal.reshape(6 * n, 6 * n)[6:, 6:], gradient.ravel()[6:]
+    which = jnp.arange(links)[:, None]
+    placed = jnp.zeros((links, 6, n, 6)).at[which, :, pairs].add(slope.transpose(0, 2, 1, 3))
+    return placed.reshape(6 * links, 6 * n)[:, 6:], value.ravel()
 
 
 def _flat(poses) -> Float[Array, " n"]:
     """The state that the slots of the table count in."""
     return jnp.concatenate([poses.ravel(), jnp.zeros(6)])
-
-
-def _solve(normal, right):
-    """Cholesky with a unit diagonal: turns and shifts differ by many orders of magnitude."""
-    scale = 1.0 / jnp.sqrt(jnp.diagonal(normal))
-    factor = jax.scipy.linalg.cho_factor(normal * scale[:, None] * scale)
-    spread = scale if right.ndim == 1 else scale[:, None]
-    return spread * jax.scipy.linalg.cho_solve(factor, spread * right)
