@@ -1,7 +1,6 @@
 """The command line: arguments, exit status, interruption. `jaxvm.commands` does the work."""
 
 import argparse
-import json
 import signal
 import sys
 import threading
@@ -12,6 +11,8 @@ from jaxvm import __version__, commands
 
 BAD_INPUT = 2
 INTERRUPTED = 130
+
+_RECORDING = "folder of a recording, a pose graph (.g2o), or the name of a public recording"
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -28,7 +29,11 @@ def main(arguments: list[str] | None = None) -> int:
         # Every foreseen complaint is a ValueError or OSError whose message names the mend.
         print(f"jaxvm {options.command}: {problem}", file=sys.stderr)
         return BAD_INPUT
-    print(json.dumps(answer, indent=1, allow_nan=False) if options.json else text)
+    if options.json:
+        from jaxvm.recording.files import json_text
+
+        text = json_text(answer).rstrip()
+    print(text)
     return 0
 
 
@@ -92,7 +97,7 @@ def _parser() -> argparse.ArgumentParser:
     diagnose.add_argument(
         "recording",
         nargs="+",
-        help="folder of a recording, or the name of a public one; several are diagnosed one by one",
+        help=f"{_RECORDING}; several are diagnosed one by one",
     )
     _model_argument(diagnose)
     diagnose.add_argument(
@@ -208,7 +213,10 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _recording_argument(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("recording", help="folder of a recording, or the name of a public one")
+    parser.add_argument(
+        "recording",
+        help=_RECORDING,
+    )
     _model_argument(parser)
 
 

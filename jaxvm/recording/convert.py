@@ -85,6 +85,8 @@ def convert(
             ".vnl, .cameramodel, .g2o, .yml or .xml file; mend the name"
         )
     if Path(out).name.endswith((".g2o", ".g2o.gz")):
+        if Path(out).exists():
+            raise FileExistsError(f"{out} is already there; choose another name or remove it")
         write_g2o(recording, out)
         return describe(recording)
     write_recording(recording, out, table)

@@ -1,11 +1,14 @@
 """Files and folders that are there complete or not at all."""
 
+import json
+import math
 import os
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 
 @contextmanager
@@ -48,3 +51,16 @@ def write_files(folder: str | Path, contents: Mapping[str, str | bytes]) -> list
     finally:
         shutil.rmtree(staging, ignore_errors=True)
     return [folder / name for name in contents]
+
+
+def json_text(content: Any) -> str:
+    """A document as JSON, one key on a line; numbers that are not finite become null."""
+
+    def sound(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {key: sound(one) for key, one in value.items()}
+        if isinstance(value, list | tuple):
+            return [sound(one) for one in value]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    return json.dumps(sound(content), indent=1, allow_nan=False) + "\n"

@@ -5,6 +5,7 @@ of the information matrix, shift before turn. FIX id holds a vertex.
 """
 
 import gzip
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from jaxvm.recording.errors import RecordingError
+from jaxvm.recording.files import write_files
 from jaxvm.recording.model import Model, Station
 from jaxvm.recording.recording import Links, Recording, no_observations
 
@@ -34,8 +36,8 @@ def import_g2o(file: str | Path, mend: bool = False) -> Recording:
             are: eigenvalues below 1e-6 of the largest one are raised to it.
 
     Raises:
-        RecordingError: the file has no edges, an unknown vertex, a malformed line, or (without
-            `mend`) information that is not positive definite.
+        RecordingError: the file has no edges, an unknown vertex, one twice, a malformed line, or
+            (without `mend`) information that is not positive definite.
     """
     file = Path(file)
     vertices, edges, held = _parse(file)
@@ -49,6 +51,10 @@ def import_g2o(file: str | Path, mend: bool = False) -> Recording:
                     f"{file.name} line {line}: vertex {number} is not in the file; "
                     "add its VERTEX_SE3:QUAT"
                 )
+    if unknown := held - vertices.keys():
+        raise RecordingError(
+            f"{file.name}: FIX {min(unknown)} names a vertex that is not in the file; mend the line"
+        )
     values = np.array([row for *_, row in edges])
     information = np.zeros((len(edges), 6, 6))
     information[:, _UPPER[0], _UPPER[1]] = values[:, 7:]
@@ -83,14 +89,27 @@ def write_g2o(recording: Recording, file: str | Path) -> None:
     Vertices keep their numbers where all stations are called by one; else they are numbered as they
     come, with the names in comments. Links of other bodies have no place in the format.
 
+    The file is there complete or as it was before.
+
     Raises:
-        ValueError: a link joins something else than stations, or a station has no pose.
+        ValueError: a link joins something else than stations, a station has no pose or moves, or
+            there are image points or ranges, which the format can't hold.
     """
     links, stations = recording.links, recording.model.stations
+    lost = len(recording.observations.epoch) + len(
+        () if recording.ranges is None else recording.ranges.epoch
+    )
+    if lost:
+        raise ValueError(
+            f"g2o knows relative poses alone: {lost} image points and ranges would be lost; make "
+            "relative poses of them first (jaxvm.pose.pose_level)"
+        )
     numbered = all(s.name.isdecimal() and str(int(s.name)) == s.name for s in stations)
     number = [int(s.name) if numbered else i for i, s in enumerate(stations)]
     lines = []
     for i, station in zip(number, stations, strict=True):
+        if station.motion == "per-epoch":
+            raise ValueError(f'station "{station.name}" moves; g2o has one pose for each vertex')
         if station.pose is None:
             raise ValueError(f'station "{station.name}" has no pose; write an adjusted model')
         if not numbered:
@@ -113,7 +132,7 @@ def write_g2o(recording: Recording, file: str | Path) -> None:
     text = "\n".join(lines) + "\n"
     file = Path(file)
     data = gzip.compress(text.encode(), mtime=0) if file.suffix == ".gz" else text.encode()
-    file.write_bytes(data)
+    write_files(file.absolute().parent, {file.name: data})
 
 
 def _parse(file: Path):
@@ -125,8 +144,12 @@ def _parse(file: Path):
         try:
             match words[0]:
                 case "VERTEX_SE3:QUAT":
+                    if int(words[1]) in vertices:
+                        raise ValueError(f"vertex {words[1]} is there already")
                     vertices[int(words[1])] = _floats(words[2:], 7)
                 case "EDGE_SE3:QUAT":
+                    if int(words[1]) == int(words[2]):
+                        raise ValueError(f"the edge joins vertex {words[1]} with itself")
                     edges.append((line, int(words[1]), int(words[2]), _floats(words[3:], 28)))
                 case "FIX":
                     held.update(map(int, words[1:]))
@@ -141,10 +164,17 @@ def _lines(file: Path) -> Iterator[tuple[int, list[str]]]:
     if not file.is_file():
         raise RecordingError(f"{file}: there is no such file; give a .g2o or .g2o.gz file")
     with gzip.open(file, "rt") if file.suffix == ".gz" else open(file) as stream:
-        for number, line in enumerate(stream, 1):
-            words = line.partition("#")[0].split()
-            if words:
-                yield number, words
+        number = 0
+        try:
+            for number, line in enumerate(stream, 1):
+                words = line.partition("#")[0].split()
+                if words:
+                    yield number, words
+        except (EOFError, OSError, zlib.error, UnicodeDecodeError) as problem:
+            raise RecordingError(
+                f"{file.name} after line {number}: it can't be read on ({problem}); is the file "
+                "whole? Fetch it again"
+            ) from None
 
 
 def _floats(words: list[str], count: int) -> list[float]:
@@ -153,6 +183,8 @@ def _floats(words: list[str], count: int) -> list[float]:
     numbers = list(map(float, words))
     if not np.isfinite(numbers).all():
         raise ValueError("a number is not finite")
+    if not any(numbers[3:7]):
+        raise ValueError("the quaternion is zero")
     return numbers
 
 
@@ -177,11 +209,17 @@ def _definite(name, lines, information, mend: bool) -> Float[np.ndarray, "n 6 6"
     bad = values[:, 0] <= 1e-12 * values[:, -1]
     if not bad.any():
         return information
-    if not mend or (values[:, -1] <= 0.0).any():
+    hopeless = np.flatnonzero(values[:, -1] <= 0.0)
+    if len(hopeless):
+        raise RecordingError(
+            f"{name} line {lines[hopeless[0]]}: the information matrix has no positive eigenvalue; "
+            "mend the line or leave it out"
+        )
+    if not mend:
         raise RecordingError(
             f"{name} line {lines[int(np.flatnonzero(bad)[0])]}: the information matrix is not "
-            f"positive definite (so are {int(bad.sum())} of {len(bad)}); mend them, or ask for "
-            "the nearest ones that are"
+            f"positive definite (so are {int(bad.sum())} of {len(bad)}); mend them, or have the "
+            "nearest ones that are: jaxvm convert --mend, import_g2o(file, mend=True)"
         )
     raised = np.where(bad[:, None], np.maximum(values, least[:, None]), values)
     return np.einsum("nij,nj,nkj->nik", vectors, raised, vectors)

@@ -319,7 +319,37 @@ def _links(table: Table | None, model: Model, ids: np.ndarray) -> Links | None:
             rows = np.flatnonzero(dated)
             part = Table(table.file, table.frame.loc[dated], table.line[dated], table.word)
             epoch[rows] = _epoch_rows(part, ids)
-    return Links(tuple(table.texts("link")), nodes["from"], nodes["to"], pose, covariance, epoch)
+    found = Links(tuple(table.texts("link")), nodes["from"], nodes["to"], pose, covariance, epoch)
+    _check_links(table, model, found, len(ids))
+    return found
+
+
+def _check_links(table: Table, model: Model, links: Links, n_epochs: int) -> None:
+    """Links join two bodies, at an epoch where they move against each other."""
+    stations = {station.name: station for station in model.stations}
+
+    def moving(node: tuple[str, int]) -> set[str]:
+        """What moves of a node: itself, or the station that carries it."""
+        kind, number = node
+        if kind == "station":
+            own, carrier = model.stations[number], model.stations[number]
+        else:
+            own = model.cameras[number] if kind == "camera" else model.targets[number]
+            carrier = stations.get(own.station)
+        found = {carrier.name} if carrier and carrier.motion == "per-epoch" else set()
+        return found | ({own.name} if kind == "target" and own.motion == "per-epoch" else set())
+
+    for row, (a, b, epoch) in enumerate(
+        zip(links.from_node, links.to_node, links.epoch, strict=True)
+    ):
+        if a == b:
+            text = table.texts("from")[row]
+            raise table.error(row, f"the link joins {text} with itself; drop it")
+        apart = moving(a) ^ moving(b)
+        if epoch < 0 and apart and n_epochs > 1:
+            raise table.error(
+                row, f'the link has no epoch, but "{min(apart)}" moves; write when it was measured'
+            )
 
 
 def _of_sigmas(table: Table) -> np.ndarray:
