@@ -4,7 +4,6 @@ Each takes the parsed options and returns its answer as data and as text. What i
 when it runs: a command that has nothing to compile starts at once.
 """
 
-import json
 import sys
 import time
 from collections.abc import Callable
@@ -105,7 +104,7 @@ def run_adjust(options):
     from jaxvm.network.scene import build
     from jaxvm.network.start import is_network, start
     from jaxvm.recording import model_text
-    from jaxvm.recording.files import write_files
+    from jaxvm.recording.files import json_text, write_files
     from jaxvm.report.network import write_network_page
     from jaxvm.solve.adjust import adjust, pixel_rms
     from jaxvm.solve.compiling import keep_compiled
@@ -126,6 +125,11 @@ def run_adjust(options):
         result, rejected, _ = snoop_links(scene, method=options.method)
     else:
         result = adjust(scene, options.method, LOSSES[options.loss]())
+    if result.failed:
+        raise ValueError(
+            f"the adjustment {result.why} (cost {result.cost:.4g}); nothing was written. Begin "
+            "from other start values (--start chordal) or with --loss cauchy"
+        )
     residuals = result.residuals()
     answer = {
         "cost_before": result.cost_before,
@@ -134,7 +138,9 @@ def run_adjust(options):
         "degrees_of_freedom": result.degrees_of_freedom,
         "pixel_rms_px": pixel_rms(result.scene, residuals) if residuals.pixels else None,
         "evaluations": result.evaluations,
+        "converged": result.converged,
         "why": result.why,
+        "covariance_scale": result.unit_variance,
         "seconds": result.seconds,
         "rejected": [{"where": r.where, "test": r.test} for r in rejected],
     }
@@ -143,9 +149,9 @@ def run_adjust(options):
         text += f"\nset aside          {r.where} (test {r.test:.1f})"
     if options.out is not None:
         progress("precision")
-        deviations = standard_deviations(result, result.variance_factor)
+        deviations = standard_deviations(result, result.unit_variance)
         files = {
-            "adjustment.json": json.dumps(answer, indent=1) + "\n",
+            "adjustment.json": json_text(answer),
             "model.toml": model_text(estimated_model(result.scene)),
             "poses.csv": pose_table(result.scene, deviations).to_csv(index=False),
         }
@@ -153,13 +159,11 @@ def run_adjust(options):
         names = list(files)
         if is_network(result.scene):
             progress("the picture of the network")
-            links = result.scene.recording.links
             page = write_network_page(
                 result,
                 options.out,
-                [links.name[r.row] for r in rejected] if links is not None else (),
                 method=options.method,
-                scale=result.variance_factor,
+                scale=result.unit_variance,
             )
             names.append(page.name)
         text += f"\nwritten            {options.out}: {', '.join(names)}"
@@ -250,7 +254,7 @@ def run_montecarlo(options):
     import numpy as np
 
     from jaxvm.network.scene import build
-    from jaxvm.recording.files import write_files
+    from jaxvm.recording.files import json_text, write_files
     from jaxvm.scenes import read_description, simulate_network
     from jaxvm.solve.compiling import keep_compiled
     from jaxvm.solve.montecarlo import station_trials
@@ -272,6 +276,11 @@ def run_montecarlo(options):
         lambda done: progress(f"{done} of {options.trials} trials"),
         world,
     )
+    if found.failed.all():
+        raise ValueError(
+            f"none of {options.trials} trials converged: the noise is too large for this network; "
+            "take smaller sigmas, or more and better placed measurements"
+        )
     ratio = np.asarray(frame["measured"]) / np.asarray(frame["predicted"])
     spread = {
         "least": float(ratio.min()),
@@ -297,7 +306,7 @@ def run_montecarlo(options):
     )
     if options.out is not None:
         files = {
-            "montecarlo.json": json.dumps(answer, indent=1) + "\n",
+            "montecarlo.json": json_text(answer),
             "montecarlo.csv": frame.to_csv(index=False),
         }
         write_files(options.out, files)

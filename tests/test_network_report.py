@@ -29,14 +29,14 @@ from jaxvm.report.network_graph import body_graph
 from jaxvm.report.network_view import first_axes, first_scale, network_view, semi_axes
 from jaxvm.report.network_words import angle, length, number
 from jaxvm.solve.adjust import adjust
-from jaxvm.solve.covariance import pose_covariances
+from jaxvm.solve.covariance import pose_covariances, standard_deviations
 from jaxvm.solve.snooping import redundancy
 
 NASTY = "</script><b>&\"'<!--"
 
 
-def linked(edges, n, seed=0, names=None, sigma=(1e-3, 2e-3), held=(0,)):
-    """Stations at random places joined by links with noise, adjusted."""
+def linked(edges, n, seed=0, names=None, sigma=(1e-3, 2e-3), held=(0,), weights=None):
+    """Stations at random places joined by links with noise, adjusted; weight 0: rejected."""
     rng = np.random.default_rng(seed)
     poses = np.concatenate([rng.uniform(-0.5, 0.5, (n, 3)), rng.uniform(-5, 5, (n, 3))], axis=1)
     names = names or [f"s{i}" for i in range(n)]
@@ -66,7 +66,7 @@ def linked(edges, n, seed=0, names=None, sigma=(1e-3, 2e-3), held=(0,)):
         Model("network", (), stations, ()), np.zeros(1, int), np.zeros(1), {}, no_observations(),
         links=links, timed=False,
     )  # fmt: skip
-    return adjust(build(recording))
+    return adjust(build(recording), link_weights=weights)
 
 
 EDGES = [(0, 1), (1, 2), (2, 0), (2, 3), (3, 4), (4, 2), (4, 5)]
@@ -270,9 +270,10 @@ class Tags(HTMLParser):
             self.text.append(data)
 
 
-def test_page_holds_all_that_it_needs(small, tmp_path):
+def test_page_holds_all_that_it_needs(tmp_path):
+    small = linked(EDGES, 6, weights=np.arange(len(EDGES)) > 0)
     page = write_network_page(
-        small, tmp_path, ["s0-s1"], {"SPGD": (np.arange(1, 4), [9.0, 5.0, small.cost])}, "a method"
+        small, tmp_path, {"SPGD": (np.arange(1, 4), [9.0, 5.0, small.cost])}, "a method"
     )
     text = page.read_text()
     assert page == tmp_path / "network.html" and "http" not in text and "@import" not in text
@@ -289,18 +290,20 @@ def test_page_holds_all_that_it_needs(small, tmp_path):
 
 def test_names_are_text_in_the_page_and_in_its_data(tmp_path):
     names = [NASTY + str(i) for i in range(3)]
-    found = linked([(0, 1), (1, 2), (2, 0)], 3, names=names)
+    found = linked([(0, 1), (1, 2), (2, 0)], 3, names=names, weights=np.array([0.0, 1.0, 1.0]))
     method = "method " + NASTY
-    text = write_network_page(
-        found, tmp_path, [NASTY], {NASTY: ([1, 2], [2.0, 1.0])}, method
-    ).read_text()
+    text = write_network_page(found, tmp_path, {NASTY: ([1, 2], [2.0, 1.0])}, method).read_text()
     parsed = Tags(text)
     assert NASTY not in text and parsed.tags.count("b") == text.count("<b>")
     assert "-->" not in text and "<!--" not in text
     data, program = parsed.scripts
     assert json.loads(data)["names"] == names and "</" not in program
     shown = "".join(parsed.text)
-    assert f"station {names[0]}" in shown and method in shown and f"Rejected: {NASTY}" in shown
+    assert (
+        f"station {names[0]}" in shown
+        and method in shown
+        and f"Rejected: {names[0]}-{names[1]}" in shown
+    )
     assert shown.count(names[1]) >= 2
 
 
@@ -316,19 +319,25 @@ def test_empty_and_broken_networks_have_a_page(tmp_path):
     apart = linked([(0, 1), (2, 3)], 4, held=(0, 2))
     told = network_document(apart)
     assert told["adjustment"]["parts"] == 2 and told["unobservable"] == []
-    both = network_document(linked([(0, 1), (1, 2)], 3, held=(0, 2)))["adjustment"]
+    document = network_document(linked([(0, 1), (1, 2)], 3, held=(0, 2)))
+    # A way between two held stations is a cycle: half of every error shows.
+    assert document["weak_edges"] == []
+    assert [edge["redundancy"] for edge in document["edges"]] == pytest.approx([0.5, 0.5], abs=0.05)
+    both = document["adjustment"]
     assert both["conditions"] == 0 and both["conditions_of_further_held"] == 6
     assert both["conditions_of_further_held"] == both["degrees_of_freedom"]
 
     # All links rejected: nothing joins anything.
-    told = network_document(chain, rejected=chain.scene.recording.links.name)
+    none = linked([(0, 1), (1, 2)], 3, weights=np.zeros(2))
+    told = network_document(none)
     assert told["edges"] == [] and len(told["unobservable"]) == 2
     assert "s1" in told["unobservable"][0]
-    page = write_network_page(chain, tmp_path, rejected=["s0-s1", "s1-s2", "long gone"])
-    assert "long gone" in page.read_text()
-    assert json.loads((tmp_path / "network.json").read_text())["rejected_not_recorded"] == [
-        "long gone"
-    ]
+    assert "s0-s1, s1-s2" in write_network_page(none, tmp_path).read_text()
+    assert none.degrees_of_freedom == 0 and none.variance_factor == 1.0
+    spread = standard_deviations(none).world_from_station
+    assert np.isnan(spread[1:]).all() and (np.asarray(spread[0]) == 0.0).all()
+    # What nothing observes has no ellipsoid, and a document without NaN.
+    assert told["bodies"][1]["position_std_max_m"] is None
 
 
 def test_a_free_camera_is_a_body_where_its_station_is_held():

@@ -44,7 +44,7 @@ def refined(plain: Adjustment, drifts: list[CameraDrift], inputs: Inputs) -> lis
     found = adjust(scene, check=False, repeats=0)
     if found.failed:
         return drifts
-    deviations = standard_deviations(found, found.variance_factor)
+    deviations = standard_deviations(found, found.unit_variance)
     sigma = np.asarray(deviations.amplitude), np.asarray(deviations.constant)
     names = [effect.name for effect in found.scene.effects]
     fitted = dict(zip(names, found.scene.fitted_effects(), strict=True))

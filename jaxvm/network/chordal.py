@@ -13,7 +13,7 @@ from cvxopt import cholmod  # pyright: ignore[reportAttributeAccessIssue]
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from jaxvm.network.graph import PoseGraph
+from jaxvm.network.graph import PoseGraph, UnconnectedNetwork
 
 
 def chordal_poses(
@@ -26,6 +26,9 @@ def chordal_poses(
         held: poses of the held nodes.
         rounds: repetitions with edges weighted down by how badly they fit (weights of the Cauchy
             distribution), against gross errors.
+
+    Raises:
+        UnconnectedNetwork: the linear equations are singular.
     """
     n = len(graph.names)
     turn = Rotation.from_rotvec(graph.pose[:, :3]).as_matrix()
@@ -110,7 +113,13 @@ def _cholesky_solve(lower: sp.coo_matrix, right):
         lower.shape,
     )  # fmt: skip
     columns = cvxopt.matrix(np.ascontiguousarray(right))
-    cholmod.linsolve(matrix, columns)
+    try:
+        cholmod.linsolve(matrix, columns)
+    except ArithmeticError as error:
+        raise UnconnectedNetwork(
+            "the edges don't join all nodes to held ones well enough for a start: covariances "
+            "differ by too many orders of magnitude, or a part hangs on none"
+        ) from error
     return np.array(columns)
 
 

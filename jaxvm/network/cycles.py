@@ -215,7 +215,7 @@ def misclosure(graph: PoseGraph, cycle: Walk) -> Misclosure:
         k = int(np.flatnonzero(reached != following)[0])
         raise ValueError(
             f'the walk does not close: edge "{graph.edge_names[cycle[k][0]]}" ends at '
-            f'"{graph.names[reached[k]]}" and the next begins at "{graph.names[following[k]]}"; '
+            f"{graph.names[reached[k]]} and the next begins at {graph.names[following[k]]}; "
             "take cycles from fundamental_cycles"
         )
     pose, covariance = compose(graph, cycle)

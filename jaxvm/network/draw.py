@@ -41,7 +41,7 @@ def drawn(network: Network, state: State, key: PRNGKeyArray, scale: float = 1.0)
         measured = network.ranges.measured + off(network.ranges)[:, 0]
         network = eqx.tree_at(lambda n: n.ranges.measured, network, measured)
     if network.priors is not None:
-        expected = network.priors.expected - off(network.priors)[:, 0]
+        expected = network.priors.expected + off(network.priors)[:, 0]
         network = eqx.tree_at(lambda n: n.priors.expected, network, expected)
     if network.links is not None:
         own = _true_links(network.links, flat)
@@ -54,7 +54,7 @@ def drawn(network: Network, state: State, key: PRNGKeyArray, scale: float = 1.0)
 
 
 def with_measurements(network: Network, other: Network) -> Network:
-    """The network with what another one of the same tables has measured."""
+    """The network with what another one of the same tables has measured; priors stay its own."""
     pixels = tuple(
         eqx.tree_at(lambda f: f.circumstances.pixel, own, its.circumstances.pixel)
         for own, its in zip(network.pixels, other.pixels, strict=True)

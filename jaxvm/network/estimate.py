@@ -59,9 +59,10 @@ def estimated_model(scene: Scene) -> Model:
 
 
 def pose_table(scene: Scene, deviations: State) -> pd.DataFrame:
-    """Poses of all stations and targets: kind, name, epoch, turn (rad), shift (m), deviations.
+    """Poses of stations and targets: kind, name, frame, epoch, turn (rad), shift (m), deviations.
 
-    A static body has one row without an epoch. `deviations` come from `standard_deviations`.
+    Frame is what the pose leads to: the world, or the station that carries the target. A static
+    body has one row without an epoch. `deviations` come from `standard_deviations`.
     """
     rows = []
     for kind, bodies, row_of, table in (
@@ -72,10 +73,11 @@ def pose_table(scene: Scene, deviations: State) -> pd.DataFrame:
         spread = np.asarray(getattr(deviations, table))
         for i, body in enumerate(bodies):
             moving = body.motion == "per-epoch"
+            frame = (kind == "target" and body.station) or "world"
             for epoch in range(len(scene.recording.time)) if moving else (0,):
                 own = row_of[i, epoch]
                 when = str(scene.recording.epoch_ids[epoch]) if moving else ""
-                rows.append((kind, body.name, when, *values[own], *spread[own]))
+                rows.append((kind, body.name, frame, when, *values[own], *spread[own]))
     numbers = [f"{part}_{axis}" for part in ("turn", "shift") for axis in "xyz"]
-    columns = ["kind", "name", "epoch", *numbers, *(f"std_{name}" for name in numbers)]
+    columns = ["kind", "name", "frame", "epoch", *numbers, *(f"std_{name}" for name in numbers)]
     return pd.DataFrame(rows, columns=columns)

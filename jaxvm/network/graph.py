@@ -22,7 +22,7 @@ class PoseGraph:
     twist = log(measured^-1 . true), turn (rad) then shift (m), with the covariance given.
 
     Attributes:
-        names: of the nodes.
+        names: of the nodes, as they stand in a sentence: station "bow".
         edges: from and to, places in `names`.
         edge_names: of the edges.
         pose: from_from_to of each edge as turn (rad) and shift (m).
@@ -119,7 +119,7 @@ def check_connected(graph: PoseGraph) -> None:
 
 
 def _names(graph: PoseGraph, nodes) -> str:
-    shown = ", ".join(f'"{graph.names[node]}"' for node in nodes[:6])
+    shown = ", ".join(graph.names[node] for node in nodes[:6])
     return shown + (f" and {len(nodes) - 6} more" if len(nodes) > 6 else "")
 
 
@@ -265,7 +265,7 @@ def best_path(
     tree = shortest_path_tree(graph, a, weight)
     if tree.depth[b] < 0:
         raise UnconnectedNetwork(
-            f'no chain of edges joins "{graph.names[a]}" to "{graph.names[b]}"; '
+            f"no chain of edges joins {graph.names[a]} to {graph.names[b]}; "
             "record an edge between their parts"
         )
     steps = tree.way_to(b)

@@ -3,7 +3,7 @@
 Scalar measurements of differences are resistors; MATHEMATICS 1.6 says when poses are.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import rustworkx as rx
@@ -29,17 +29,19 @@ class WeakEdge:
         name: of the edge.
         ends: names of its nodes.
         redundancy: the share of an error of this edge that shows in its residual; 0 for a bridge.
+        bridge: whether it is in no cycle.
     """
 
     edge: int
     name: str
     ends: tuple[str, str]
     redundancy: float
+    bridge: bool
 
     def words(self) -> str:
         """What is weak and what mends it, in a sentence."""
-        edge = f'edge "{self.name}" ("{self.ends[0]}" to "{self.ends[1]}")'
-        if self.redundancy == 0.0:
+        edge = f'edge "{self.name}" ({self.ends[0]} to {self.ends[1]})'
+        if self.bridge:
             return f"{edge} is in no cycle: nothing checks or improves it; measure another way"
         return (
             f"{edge} is hardly checked: only {100 * self.redundancy:.2g} % of an error in it would "
@@ -47,9 +49,20 @@ class WeakEdge:
         )
 
 
+def held_as_one(graph: PoseGraph) -> PoseGraph:
+    """The graph with all held nodes made one: between them nothing is unknown.
+
+    A way from one held node to another is a cycle there. The other held nodes stay without edges.
+    """
+    ends = graph.edges
+    if len(graph.held):
+        ends = np.where(np.isin(ends, graph.held), graph.held[0], ends)
+    return replace(graph, edges=ends)
+
+
 def bridges(graph: PoseGraph) -> Int[np.ndarray, " bridges"]:
-    """Edges in no cycle, ascending: nothing checks or improves them."""
-    pairs, place, times = _pairs(graph)
+    """Edges in no cycle, ascending: nothing checks or improves them. Held nodes count as one."""
+    pairs, place, times = _pairs(held_as_one(graph))
     network = rx.PyGraph(multigraph=False)
     network.add_nodes_from(range(len(graph.names)))
     network.add_edges_from_no_data([(a, b) for a, b in pairs.tolist() if a != b])
@@ -74,6 +87,7 @@ def effective_resistance(
     For scalar measurements of differences with these variances the adjusted difference has the
     variance of resistors of these values between the two nodes; for poses it holds with equal
     isotropic noise and small angles (MATHEMATICS 1.6). Infinite where no edges join the nodes.
+    Held nodes count as one.
 
     Args:
         variance: of each edge, positive; `edge_variance` (m^2) if not given.
@@ -81,7 +95,11 @@ def effective_resistance(
     Raises:
         ValueError: a variance is not positive and finite.
     """
-    return float(_resistances(graph, np.array([[a, b]]), positive_variances(graph, variance))[0])
+    value, joined = positive_variances(graph, variance), held_as_one(graph)
+    if np.isin([a, b], graph.held).all():
+        return 0.0
+    a, b = (int(graph.held[0]) if node in graph.held else node for node in (a, b))
+    return float(_resistances(joined, np.array([[a, b]]), value)[0])
 
 
 def redundancy_numbers(
@@ -89,8 +107,8 @@ def redundancy_numbers(
 ) -> Float[np.ndarray, " edges"]:
     """r_e = 1 - R_eff(e) / variance_e: the share of an edge's error that shows in its residual.
 
-    0 for bridges; all together they make E - V + C (MATHEMATICS 1.6). One factorisation, and one
-    sparse solve for each pair of joined nodes.
+    0 for bridges, 1 between held nodes; all together they make E - V + C, the held nodes counted as
+    one (MATHEMATICS 1.6). One factorisation, and one sparse solve for each pair of joined nodes.
 
     Args:
         variance: of each edge, positive; `edge_variance` if not given.
@@ -98,9 +116,9 @@ def redundancy_numbers(
     Raises:
         ValueError: a variance is not positive and finite.
     """
-    value = positive_variances(graph, variance)
-    pairs, place, _ = _pairs(graph)
-    redundancy = 1.0 - _resistances(graph, pairs, value)[place] / value
+    value, joined = positive_variances(graph, variance), held_as_one(graph)
+    pairs, place, _ = _pairs(joined)
+    redundancy = 1.0 - _resistances(joined, pairs, value)[place] / value
     redundancy[bridges(graph)] = 0.0
     return np.clip(redundancy, 0.0, 1.0)
 
@@ -115,14 +133,15 @@ def weak_edges(
     Args:
         variance: of each edge, positive; `edge_variance` if not given.
     """
-    redundancy = redundancy_numbers(graph, variance)
-    weak = np.union1d(bridges(graph), np.flatnonzero(redundancy < threshold))
+    redundancy, alone = redundancy_numbers(graph, variance), bridges(graph)
+    weak = np.union1d(alone, np.flatnonzero(redundancy < threshold))
     return [
         WeakEdge(
             int(edge),
             graph.edge_names[edge],
             (graph.names[graph.edges[edge, 0]], graph.names[graph.edges[edge, 1]]),
             float(redundancy[edge]),
+            bool(np.isin(edge, alone)),
         )
         for edge in weak[np.argsort(redundancy[weak], kind="stable")]
     ]

@@ -152,7 +152,10 @@ def name_of(scene: Scene, key: Key) -> str:
         return f'camera "{scene.model.cameras[row].name}"'
     rows = scene.station_row if kind == "station" else scene.target_row
     bodies = scene.model.stations if kind == "station" else scene.model.targets
-    return f'{kind} "{bodies[int(np.argmax((rows == row).any(axis=1)))].name}"'
+    body = int(np.argmax((rows == row).any(axis=1)))
+    moving = bodies[body].motion == "per-epoch"
+    when = f" at epoch {scene.recording.epoch_ids[np.argmax(rows[body] == row)]}" if moving else ""
+    return f'{kind} "{bodies[body].name}"{when}'
 
 
 WORLD: Key = ("world", 0)

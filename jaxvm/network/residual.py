@@ -77,10 +77,12 @@ def residual(state: State, network: Network) -> Residuals:
     def block(factor: Factor | None):
         if factor is None:
             return None
-        return rows(factor, network, flat, values) * whitening(factor)
+        # What is set aside counts nothing, even where it can't be predicted at all.
+        used = factor.weight[:, None] > 0.0
+        return jnp.where(used, rows(factor, network, flat, values), 0.0) * whitening(factor)
 
     return Residuals(
-        tuple(rows(f, network, flat, values) * whitening(f) for f in network.pixels),
+        tuple(map(block, network.pixels)),
         block(network.ranges),
         block(network.links),
         block(network.edges),

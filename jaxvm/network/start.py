@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from jaxvm.geometry.lenses import lens_family
 from jaxvm.geometry.matrices import matrix, vector
 from jaxvm.network.chordal import chordal_poses
-from jaxvm.network.graph import check_connected
+from jaxvm.network.graph import UnconnectedNetwork, check_connected
 from jaxvm.network.relations import (
     Key,
     Relation,
@@ -53,7 +53,7 @@ def start(scene: Scene, poses: Start = "auto") -> Scene:
 
     Raises:
         StartError: a camera without known intrinsics sees no target well enough, or a body can't
-            be reached from the others through any view or link.
+            be reached from the others through any view or link. ("best" needs one way that can.)
     """
     views = collect_views(scene.recording)
     scene = _start_intrinsics(scene, views)
@@ -62,14 +62,21 @@ def start(scene: Scene, poses: Start = "auto") -> Scene:
         poses = _usual(scene)
     if poses == "given":
         return _placed(scene, _chain(scene, relations, held_poses(scene)))
-    rounds = (0,) if poses == "chordal" else (0, _ROUNDS)
-    found = [
-        _placed(scene, _chain(scene, relations, _chordal(scene, relations, n))) for n in rounds
-    ]
-    if poses == "best":
-        found.append(_placed(scene, _chain(scene, relations, held_poses(scene))))
-        found.sort(key=_misfit)
-    return found[0]
+    if poses == "chordal":
+        return _placed(scene, _chain(scene, relations, _chordal(scene, relations)))
+    found, refused = [], []
+    for way in (
+        lambda: _chordal(scene, relations),
+        lambda: _chordal(scene, relations, _ROUNDS),
+        lambda: held_poses(scene),
+    ):
+        try:
+            found.append(_placed(scene, _chain(scene, relations, way())))
+        except (StartError, UnconnectedNetwork) as error:
+            refused.append(error)
+    if not found:
+        raise refused[0]
+    return min(found, key=_misfit)
 
 
 def is_network(scene: Scene) -> bool:
@@ -96,7 +103,7 @@ _ROUNDS = 10
 """Repetitions of a chordal start with weights against gross errors."""
 
 
-def _chordal(scene: Scene, relations: list[Relation], rounds: int) -> dict[Key, np.ndarray]:
+def _chordal(scene: Scene, relations: list[Relation], rounds: int = 0) -> dict[Key, np.ndarray]:
     """Held poses, and those that relations give all together."""
     known = _with_origin(scene, relations, held_poses(scene, given=False))
     graph, keys = pose_graph(scene, relations, known)
@@ -260,7 +267,7 @@ def _with_poses(scene: Scene, known) -> Scene:
     ):
         for i in range(len(bodies)):
             _fill_gaps(tables[kind], reached[kind], rows[i])
-            _unwrap(tables[kind], rows[i])
+            _shorten(tables[kind], rows[i])
     state = eqx.tree_at(
         lambda s: (s.station_from_camera, s.world_from_station, s.carrier_from_target),
         scene.state,
@@ -277,7 +284,7 @@ def _fill_gaps(table: np.ndarray, reached: np.ndarray, rows: np.ndarray) -> None
             table[row] = table[have[np.argmin(np.abs(have - row))]]
 
 
-def _unwrap(table: np.ndarray, rows: np.ndarray) -> None:
+def _shorten(table: np.ndarray, rows: np.ndarray) -> None:
     """Rotation vectors have length at most pi; the zero of their far double is never used."""
     turns = table[rows, :3]
     table[rows, :3] = Rotation.from_rotvec(turns).as_rotvec()

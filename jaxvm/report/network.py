@@ -1,7 +1,7 @@
 """The picture page of an adjusted network: network.html, and its numbers as network.json."""
 
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -50,7 +50,6 @@ class NetworkNumbers:
 def write_network_page(
     adjustment: Adjustment,
     folder: str | Path,
-    rejected: Collection[str] = (),
     histories: Mapping[str, History] | None = None,
     method: str = "",
     scale: float = 1.0,
@@ -60,10 +59,9 @@ def write_network_page(
     The page holds all that it needs: nothing is fetched. Files of an earlier page are replaced.
 
     Args:
-        adjustment: of a scene with links, sight lines, or both.
+        adjustment: of a scene with links, sight lines, or both. Links of weight zero are shown as
+            rejected.
         folder: made if it is not there.
-        rejected: names of links that data snooping set aside: they count nothing in the adjustment,
-            or are not in its recording any more (then they are named, not drawn).
         histories: of further methods: evaluations, and the cost after each.
         method: that the adjustment itself used, in words.
         scale: factor on covariances: 1 trusts the stated sigmas, the variance factor the residuals.
@@ -71,7 +69,7 @@ def write_network_page(
     Raises:
         ValueError: a history has not one cost for each evaluation.
     """
-    numbers = _numbers(adjustment, rejected, histories, method, scale)
+    numbers = _numbers(adjustment, histories, method, scale)
     page = _html(numbers)
     text = json.dumps(numbers.document, allow_nan=False) + "\n"
     write_files(folder, {"network.json": text, "network.html": page})
@@ -80,7 +78,6 @@ def write_network_page(
 
 def network_document(
     adjustment: Adjustment,
-    rejected: Collection[str] = (),
     histories: Mapping[str, History] | None = None,
     method: str = "",
     scale: float = 1.0,
@@ -90,11 +87,11 @@ def network_document(
     Turns are in rad, shifts in m. A standard deviation "max" is the one along the worst direction.
     Bodies, edges and cycles are referred to by their places in the lists.
     """
-    return _numbers(adjustment, rejected, histories, method, scale).document
+    return _numbers(adjustment, histories, method, scale).document
 
 
-def _numbers(adjustment, rejected, histories, method, scale) -> NetworkNumbers:
-    bodies = body_graph(adjustment, frozenset(rejected), scale)
+def _numbers(adjustment, histories, method, scale) -> NetworkNumbers:
+    bodies = body_graph(adjustment, scale)
     curves = {method or "this adjustment": _own_history(adjustment)}
     for name, (evaluations, costs) in (histories or {}).items():
         evaluations, costs = np.ravel(evaluations), np.ravel(costs)
@@ -114,7 +111,6 @@ def _numbers(adjustment, rejected, histories, method, scale) -> NetworkNumbers:
             {"name": name, "from": int(bodies.body[a]), "to": int(bodies.body[b])}
             for name, a, b in bodies.rejected
         ],
-        "rejected_not_recorded": sorted(set(rejected) - {name for name, *_ in bodies.rejected}),
         "weak_edges": _weak(bodies),
         "unobservable": _unobservable(bodies),
         "cycles": _cycles(bodies),
@@ -199,19 +195,24 @@ def distances(bodies: BodyGraph) -> Int[np.ndarray, " nodes"]:
 
 
 def worst_deviation(covariance: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:
-    """Standard deviation along the direction in which it is largest."""
-    return np.sqrt(np.maximum(np.linalg.eigvalsh(covariance).max(axis=1, initial=0.0), 0.0))
+    """Standard deviation along the direction in which it is largest; NaN where it is not known."""
+    known = np.isfinite(covariance).all(axis=(1, 2))
+    values = np.linalg.eigvalsh(np.where(known[:, None, None], covariance, 0.0))
+    return np.where(known, np.sqrt(np.maximum(values.max(axis=1, initial=0.0), 0.0)), np.nan)
 
 
 def _bodies(adjustment: Adjustment, bodies: BodyGraph) -> list[dict[str, Any]]:
-    """One entry for each body; of one that moves, deviations are those of its worst pose."""
+    """One entry for each body; of one that moves, deviations are those of its worst pose.
+
+    None stands for what no observation tells.
+    """
     epochs, far = adjustment.scene.recording.epoch_ids, distances(bodies)
     shift = worst_deviation(bodies.covariance[:, 3:, 3:])
     turn = worst_deviation(bodies.covariance[:, :3, :3])
     axes = np.sqrt(np.maximum(np.diagonal(bodies.covariance, axis1=1, axis2=2), 0.0))
     result = []
     for body in bodies.bodies:
-        worst = int(np.argmax(shift[body.nodes]))
+        worst = int(np.argmax(np.nan_to_num(shift[body.nodes], nan=-1.0)))
         k, reached = body.nodes[worst], far[body.nodes]
         result.append(
             {
@@ -225,11 +226,13 @@ def _bodies(adjustment: Adjustment, bodies: BodyGraph) -> list[dict[str, Any]]:
                 "distance_edges": int(reached[reached >= 0].min(initial=len(far) + 1))
                 if (reached >= 0).any()
                 else None,
-                "position_std_m": axes[k, 3:].tolist(),
-                "position_std_max_m": float(shift[k]),
-                "turn_std_rad": axes[k, :3].tolist(),
-                "turn_std_max_rad": float(turn[k]),
-                "position_covariance_m2": bodies.covariance[k, 3:, 3:].tolist(),
+                "position_std_m": _numbers_or_none(axes[k, 3:]),
+                "position_std_max_m": _finite(shift[k]),
+                "turn_std_rad": _numbers_or_none(axes[k, :3]),
+                "turn_std_max_rad": _finite(turn[k]),
+                "position_covariance_m2": [
+                    _numbers_or_none(r) for r in bodies.covariance[k, 3:, 3:]
+                ],
             }
         )
     return result
@@ -262,7 +265,7 @@ def _weak(bodies: BodyGraph) -> list[dict[str, Any]]:
     result = []
     for k in weak[np.argsort(share[weak], kind="stable")]:
         ends = (graph.names[graph.edges[k, 0]], graph.names[graph.edges[k, 1]])
-        edge = WeakEdge(int(k), graph.edge_names[k], ends, float(share[k]))
+        edge = WeakEdge(int(k), graph.edge_names[k], ends, float(share[k]), bool(bodies.bridge[k]))
         result.append({"edge": int(k), "redundancy": float(share[k]), "words": edge.words()})
     return result
 
@@ -271,7 +274,7 @@ def _unobservable(bodies: BodyGraph) -> list[str]:
     """Parts that no link or sight line joins to a held body, in words."""
     graph, result = bodies.graph, []
     for part in unheld_parts(graph) if graph.names else []:
-        shown = ", ".join(f'"{graph.names[node]}"' for node in part[:6])
+        shown = ", ".join(graph.names[node] for node in part[:6])
         more = f" and {len(part) - 6} more" if len(part) > 6 else ""
         result.append(
             f"no link or sight line joins {shown}{more} to a held body: only priors or other "
@@ -289,7 +292,10 @@ def _cycles(bodies: BodyGraph) -> list[dict[str, Any]]:
     basis = minimum_cycle_basis(graph) if few else fundamental_cycles(graph)
     result = []
     for cycle in sorted(basis, key=len)[:_MOST_CYCLES]:
-        found = misclosure(graph, cycle)
+        try:
+            found = misclosure(graph, cycle)
+        except ValueError:  # views without a pixel's worth of noise: there is nothing to test by
+            continue
         walked = [graph.edges[edge][:: 1 if sign > 0 else -1] for edge, sign in cycle]
         result.append(
             {
@@ -343,7 +349,9 @@ def _html(numbers: NetworkNumbers) -> str:
     script = resources.files("jaxvm.report").joinpath("templates/network.js").read_text("utf-8")
     stations = sorted(
         (body for body in d["bodies"] if not body["held"]),
-        key=lambda body: -body["position_std_max_m"],
+        key=lambda body: (
+            -np.inf if body["position_std_max_m"] is None else -body["position_std_max_m"]
+        ),
     )
     view = network_view(numbers.bodies, d)
     return environment.get_template("network.html.j2").render(

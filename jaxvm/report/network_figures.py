@@ -52,7 +52,11 @@ def growth_figures(bodies: list[dict[str, Any]]) -> list[str]:
     One point for each body, or for many the median and the middle 90 % at each distance. None where
     no body is free and joined to a held one.
     """
-    shown = [b for b in bodies if not b["held"] and b["distance_edges"] is not None]
+    shown = [
+        b
+        for b in bodies
+        if not b["held"] and None not in (b["distance_edges"], b["position_std_max_m"])
+    ]
     if not shown:
         return []
     distance = np.array([b["distance_edges"] for b in shown])

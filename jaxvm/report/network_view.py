@@ -28,8 +28,8 @@ def network_view(bodies: BodyGraph, document: dict[str, Any]) -> dict[str, Any]:
     low, high = (f(axis=0) if len(position) else np.zeros(3) for f in (position.min, position.max))
     middle = 0.5 * (low + high)
     size = float(np.linalg.norm(high - low)) or 1.0
-    covariance = np.array([body["position_covariance_m2"] for body in listed]).reshape(-1, 3, 3)
-    semi = semi_axes(covariance)
+    covariance = np.array([body["position_covariance_m2"] for body in listed], float)
+    semi = semi_axes(np.nan_to_num(covariance.reshape(-1, 3, 3)))
     longest = np.linalg.norm(semi, axis=2).max(axis=1, initial=0.0)
     pairs, of_edge = _pairs(bodies, document)
     drawn = _chosen(pairs)
@@ -42,8 +42,8 @@ def network_view(bodies: BodyGraph, document: dict[str, Any]) -> dict[str, Any]:
         "held": [int(body["held"]) for body in listed],
         "distance": [body["distance_edges"] for body in listed],
         "position": _rounded(position - middle, size * 1e-6),
-        "sigma_m": _digits([body["position_std_max_m"] for body in listed]),
-        "sigma_rad": _digits([body["turn_std_max_rad"] for body in listed]),
+        "sigma_m": _digits([body["position_std_max_m"] or 0.0 for body in listed]),
+        "sigma_rad": _digits([body["turn_std_max_rad"] or 0.0 for body in listed]),
         "epoch": [body["worst_epoch"] for body in listed],
         "ellipsoid": _digits(semi.ravel()),
         "traces": _traces(bodies, middle, size),

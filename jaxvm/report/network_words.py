@@ -8,17 +8,19 @@ _ANGLES = ((1.0, "rad"), (1e-3, "mrad"), (1e-6, "µrad"), (1e-9, "nrad"))
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
-def length(metres: float) -> str:
-    """A length with three digits and the unit that suits it."""
+def length(metres: float | None) -> str:
+    """A length with three digits and the unit that suits it; a dash where there is none."""
     return _scaled(metres, _LENGTHS)
 
 
-def angle(radians: float) -> str:
-    """An angle with three digits and the unit that suits it."""
+def angle(radians: float | None) -> str:
+    """An angle with three digits and the unit that suits it; a dash where there is none."""
     return _scaled(radians, _ANGLES)
 
 
-def _scaled(value: float, units: tuple[tuple[float, str], ...]) -> str:
+def _scaled(value: float | None, units: tuple[tuple[float, str], ...]) -> str:
+    if value is None:
+        return "–"
     if value == 0.0:
         return f"0 {units[0][1]}"
     fitting = (entry for entry in units if abs(value) >= 0.9995 * entry[0])

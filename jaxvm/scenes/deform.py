@@ -72,7 +72,7 @@ def displacements(
         axis, origin: of the structure, in the world.
         amplitude: of each mode, by its key.
         time: of the epochs (s).
-        period: of the modes (s).
+        period: of bending and torsion (s); sway has half of it, settling a third as time constant.
     """
     along = np.asarray(axis)
     # Rows are the structure's axes in the world.

@@ -18,7 +18,7 @@ from jaxvm.solve.large import check_large_gauge, is_large, minimise_large, scale
 from jaxvm.solve.lbfgs import minimise_lbfgs
 from jaxvm.solve.optimise import METHODS, minimise
 from jaxvm.solve.problem import Problem, normal_at, scaled, scene_problem
-from jaxvm.solve.robust import Loss
+from jaxvm.solve.robust import Loss, SquaredLoss
 from jaxvm.solve.sparse import Pattern, SparseFactors
 from jaxvm.solve.spgd import minimise_spgd
 
@@ -74,8 +74,18 @@ class Adjustment:
 
     @property
     def variance_factor(self) -> float:
-        """Chi-square per degree of freedom: 1 when the model and the sigmas are right."""
-        return 2.0 * self.cost / max(self.degrees_of_freedom, 1)
+        """Twice the cost per degree of freedom: 1 when the model and the sigmas are right.
+
+        Without a robust loss it is chi-square per degree of freedom. Also 1 where there is none
+        (as many unknowns as observations): then only the sigmas tell how good the result is.
+        """
+        f = self.degrees_of_freedom
+        return 2.0 * self.cost / f if f > 0 else 1.0
+
+    @property
+    def unit_variance(self) -> float:
+        """Scale of covariances that trusts the residuals; 1 where a robust loss shrank them."""
+        return self.variance_factor if isinstance(self.problem.loss, SquaredLoss) else 1.0
 
     @property
     def converged(self) -> bool:
@@ -108,7 +118,7 @@ class Adjustment:
                 f"variance factor    {self.variance_factor:.4g}"
                 f"  ({self.degrees_of_freedom} degrees of freedom)",
                 *pixels,
-                f"steps              {self.accepted} accepted of {self.evaluations}",
+                f"evaluations        {self.evaluations}, of which {self.accepted} were steps",
                 f"stopped            {self.why}",
                 f"time               {self.seconds:.2f} s, of which compiling"
                 f" {self.seconds_compiling:.2f} s",
@@ -138,7 +148,8 @@ def adjust(
     Args:
         scene: scene at its start values.
         method: "levenberg-marquardt" or "gauss-newton"; "spgd" (stochastic parallel gradient
-            descent) and "lbfgs" for comparison.
+            descent) and "lbfgs" for comparison: these have rules of their own to stop, and at
+            least 200,000 evaluations of the cost.
         loss: robust loss; least squares by default.
         weights: weight of every observation of every pixel table (0 sets it aside).
         range_weights, link_weights: the same for the ranges and for the links.
@@ -170,12 +181,16 @@ def adjust(
         again, before = _adjusted(found.scene, method, check=False, **options), change
         if again.failed:
             break
+        at = again.evaluations_at
+        if at is not None and found.evaluations_at is not None:
+            at = np.concatenate([found.evaluations_at, found.evaluations + at])
         found = replace(
             again,
             cost_before=found.cost_before,
             evaluations=found.evaluations + again.evaluations,
             accepted=found.accepted + again.accepted,
             history=np.concatenate([found.history, again.history]),
+            evaluations_at=at,
         )
     return replace(
         found,

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
 import lineax as lx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 
 class Arrow(lx.AbstractLinearOperator):
@@ -82,6 +82,7 @@ class ArrowFactors(eqx.Module):
     """Cholesky factors of an arrow matrix."""
 
     arrow: Arrow
+    touched: Bool[Array, " n"]  # unknowns with a diagonal
     local: Float[Array, "groups d d"]
     coupled: Float[Array, "groups d s"]  # L^-1 W of each group
     reduced: Float[Array, "s s"]
@@ -114,7 +115,9 @@ def factorise(arrow: Arrow) -> ArrowFactors:
     coupled = _lower_solve(local, arrow.coupling)
     s, groups, d = arrow.sizes
     tall = jnp.reshape(coupled, (groups * d, s))
-    return ArrowFactors(arrow, local, coupled, jnp.linalg.cholesky(arrow.shared - tall.T @ tall))
+    return ArrowFactors(
+        arrow, diagonal != 0.0, local, coupled, jnp.linalg.cholesky(arrow.shared - tall.T @ tall)
+    )
 
 
 class ArrowCholesky(lx.AbstractLinearSolver[ArrowFactors]):

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from jaxvm.network.state import State
 from jaxvm.solve.adjust import Adjustment
 from jaxvm.solve.arrow import ArrowFactors, factorise
+from jaxvm.solve.gauge import RankDeficiency
 from jaxvm.solve.large import is_large
 from jaxvm.solve.problem import Problem, normal_at
 from jaxvm.solve.selected import SelectedInverse
@@ -41,7 +42,12 @@ def _factors(adjustment: Adjustment) -> ArrowFactors | SparseFactors:
     """The factorised normal matrix at the solution."""
     if is_large(adjustment.problem):
         factors = SparseFactors(Pattern.of(adjustment.problem))
-        factors.factorise(sparse_normal(adjustment.problem, factors.pattern, adjustment.x))
+        normal = sparse_normal(adjustment.problem, factors.pattern, adjustment.x)
+        if not factors.factorise(normal):
+            raise RankDeficiency(
+                "the normal equations at the solution are singular: there is no covariance; "
+                "adjust with check=True to have the unknowns named"
+            )
         return factors
     return _factorised(normal_at(adjustment.problem, adjustment.x).hessian)
 
@@ -98,37 +104,49 @@ def pose_covariances(
 ) -> Float[np.ndarray, "rows 6 6"]:
     """Covariance of every pose of a table of the state: turn (rad), then shift (m).
 
-    Zero where it is held. The turn is that of the pose's rotation vector.
+    Zero where it is held, NaN where it is free and no observation touches it. The turn is that of
+    the pose's rotation vector.
     """
     problem = adjustment.problem
     layout = problem.network.layout
     positions = layout.slots(table, np.arange(layout.shapes[table][0]))
     columns, factor = np.asarray(problem.column)[positions], np.asarray(problem.factor)[positions]
     if is_large(problem):
-        inverse = SelectedInverse.of(adjustment.problem, adjustment.x).blocks(columns)
+        selected = SelectedInverse.of(adjustment.problem, adjustment.x)
+        inverse, touched = selected.blocks(columns), selected.diagonal() > 0.0
     else:
         inverse = np.zeros((*columns.shape, 6))
         factors = _factors(adjustment)
+        assert isinstance(factors, ArrowFactors)
+        touched = np.asarray(factors.touched)
         for row, own in enumerate(columns):
             live = np.flatnonzero(own < problem.n)
             units = np.zeros((problem.n, 6))
             units[own[live], live] = 1.0
             solved = np.asarray(_solve(factors, jnp.asarray(units)))
             inverse[row][np.ix_(live, live)] = solved[own[live]][:, live]
+    unseen = ~np.append(touched, True)[np.minimum(columns, problem.n)].all(axis=1)
+    inverse[unseen] = np.nan
     return scale * factor[:, :, None] * inverse * factor[:, None, :]
 
 
 def standard_deviations(adjustment: Adjustment, scale: float = 1.0) -> State:
-    """Standard deviation of every parameter of the state; zero where it is held."""
+    """Standard deviation of every parameter of the state.
+
+    Zero where it is held, NaN where it is free and no observation touches it.
+    """
     problem = adjustment.problem
     if is_large(problem):
-        variance = SelectedInverse.of(problem, adjustment.x).diagonal()
+        inverse = SelectedInverse.of(problem, adjustment.x)
+        variance, touched = inverse.diagonal(), inverse.diagonal() > 0.0
         variance = np.append(np.where(np.asarray(problem.active), variance, 0.0), 0.0)
         flat = jnp.abs(problem.factor) * jnp.sqrt(variance[np.asarray(problem.column)])
     else:
         factors = _factors(adjustment)
         assert isinstance(factors, ArrowFactors)
-        flat = _marginals(problem, factors)
+        flat, touched = _marginals(problem, factors), factors.touched
+    unknown = np.append(np.asarray(problem.active) & ~np.asarray(touched), False)
+    flat = jnp.where(unknown[np.asarray(problem.column)], jnp.nan, flat)
     return adjustment.problem.network.layout.restore(jnp.sqrt(scale) * flat)
 
 

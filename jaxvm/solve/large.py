@@ -96,9 +96,10 @@ def minimise_large(
         if abs(foretold) <= rtol * normal.cost + atol and damping <= 1.0:
             # The last step: its cost is wanted, no equations for a further one.
             cost = total_cost(problem, jnp.asarray(x + step))
-            if cost <= normal.cost:
+            lower = cost <= normal.cost
+            if lower:
                 x, accepted = x + step, accepted + 1
-            history.append(min(cost, normal.cost))
+            history.append(cost if lower else normal.cost)
             why = "converged: the cost no longer changes"
             break
         trial = sparse_normal(problem, normal.pattern, jnp.asarray(x + step))
@@ -111,8 +112,11 @@ def minimise_large(
         if settled and damping <= 1.0:
             why = "converged: the cost no longer changes"
             break
-        if not better and (not careful or damping > _MOST_DAMPING):
-            why = "failed: no step lowers the cost"
+        if not better and not careful:
+            why = "failed: the cost is no number after a full step"
+            break
+        if not better and damping > _MOST_DAMPING:
+            why = "converged: no step lowers the cost any more"
             break
         if careful:
             ratio = gained / foretold if foretold > 0.0 else -1.0
@@ -148,7 +152,7 @@ def check_large_gauge(
         vector = np.where(used, factors.solve(vector), 0.0)
         vector /= np.linalg.norm(vector)
     eigenvalue = float(_seen(problem, jnp.asarray(vector)))
-    if eigenvalue <= _UNSEEN:
+    if not eigenvalue > _UNSEEN:
         raise deficiency([named_direction(eigenvalue, vector, unknowns.names())])
 
 

@@ -71,9 +71,11 @@ class MonteCarlo:
     @property
     def chi_square(self) -> float:
         """Mean of e^T C^+ e over the rank of C: 1 where the predicted covariance is right."""
-        values, vectors = np.linalg.eigh(self.covariance)
+        # Turns in rad and shifts in m differ by many orders of magnitude.
+        scale = np.where(self.predicted > 0.0, self.predicted, 1.0)
+        values, vectors = np.linalg.eigh(self.covariance / np.outer(scale, scale))
         kept = values > 1e-10 * values[-1]
-        white = self.errors @ vectors[:, kept] / np.sqrt(values[kept])
+        white = self.errors / scale @ vectors[:, kept] / np.sqrt(values[kept])
         return float(np.mean(white**2))
 
 
@@ -182,7 +184,9 @@ def _trials(problem: Problem, quantity: Quantity, keys, source):
     network, state = (problem.network, truth) if source is None else source
 
     def one(key):
-        measured = with_measurements(problem.network, drawn(network, state, key))
+        # Priors are the model's own, whatever the world is: they are drawn about its truth.
+        own = drawn(problem.network, truth, key)
+        measured = own if source is None else with_measurements(own, drawn(network, state, key))
         own = eqx.tree_at(lambda p: p.network, problem, measured)
 
         def step(state):

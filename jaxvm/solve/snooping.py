@@ -9,12 +9,14 @@ from dataclasses import dataclass
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.stats import chi2
 
 from jaxvm.network.factors import LinkFactor
+from jaxvm.network.relations import held_poses, link_relations
 from jaxvm.network.scene import Scene
-from jaxvm.recording import Links
 from jaxvm.solve.adjust import Adjustment, adjust
 from jaxvm.solve.arrow import factorise
 from jaxvm.solve.large import is_large
@@ -173,44 +175,53 @@ def snoop_links(
     alpha: float = 0.001,
     method: str = "levenberg-marquardt",
     max_rounds: int = 20,
+    scale: float = 1.0,
 ) -> tuple[Adjustment, list[Rejected], Float[np.ndarray, " links"]]:
     """Adjust a network and reject links with gross errors, by name.
 
     A robust adjustment (Cauchy) first takes the network to where most links agree, and sets aside
     what is far off there. Then rounds of least squares: of the links that fail, those that are
-    worst at both of their bodies are set aside, and those that pass again come back.
+    worst at both of their bodies are set aside, and those that pass again come back. A link stays
+    where without it links would no longer join what they join now: nothing else checks it.
 
     Args:
         scene: with links, at start values.
         alpha: probability to reject one sound link (Baarda 1968).
         method: of `adjust`.
         max_rounds: bound on the rounds.
+        scale: variance of unit weight. 1 trusts the stated covariances: where they are too small
+            by far, many sound links fail.
 
     Returns:
         The last adjustment, the rejected links (`row` counts links), and the weights of all.
 
     Raises:
         ValueError: the recording has no links.
+        RankDeficiency: the links that are left don't determine all unknowns, by name.
     """
     links = scene.recording.links
     if links is None:
         raise ValueError("the recording has no links; image points are snooped by `snoop`")
     robust = adjust(scene, method, CauchyLoss())
-    square = np.sum(np.asarray(robust.residuals().links) ** 2, axis=1)
-    weights = np.where(square > _FAR * chi2.isf(alpha, 6), 0.0, 1.0)
+    square = np.sum(np.asarray(robust.residuals().links) ** 2, axis=1) / scale
+    ends = _ends(scene)
+    weights = np.ones(len(square))
+    weights = _without(ends, weights, square * (square > _FAR * chi2.isf(alpha, 6)))
     tried: set[bytes] = set()
     while True:
         tried.add(weights.tobytes())
-        adjustment = adjust(robust.scene, method, link_weights=weights, check=False)
+        adjustment = adjust(robust.scene, method, link_weights=weights)
         test, freedom = link_tests(adjustment)
+        test = test / scale
         fails = test > chi2.isf(alpha, np.maximum(freedom, 1))
         changed = np.where((weights == 0.0) & ~fails, 1.0, weights)
-        changed[_worst_at_both_ends(links, np.where(fails & (weights > 0.0), test, 0.0))] = 0.0
+        worst = _worst_at_both_ends(ends, np.where(fails & (weights > 0.0), test, 0.0))
+        changed = _without(ends, changed, np.where(worst, test, 0.0))
         if changed.tobytes() in tried or len(tried) >= max_rounds:
             break
         weights = changed
     rejected = [
-        Rejected(int(k), float(test[k]), f"link {links.name[k]}")
+        Rejected(int(k), float(test[k]), _where_link(scene, int(k)))
         for k in np.flatnonzero(weights == 0.0)
     ]
     return adjustment, rejected, weights
@@ -220,19 +231,46 @@ _FAR = 4.0
 """How many times the limit of a test a robust residual has to be for the link to be set aside."""
 
 
-def _worst_at_both_ends(links: Links, value: np.ndarray) -> np.ndarray:
-    """Links whose (positive) value is the largest among all links at both of their bodies."""
-    bodies: dict[tuple[str, int], int] = {}
-    ends = np.array(
-        [
-            [bodies.setdefault(node, len(bodies)) for node in pair]
-            for pair in zip(links.from_node, links.to_node, strict=True)
-        ]
-    )
-    largest = np.zeros(len(bodies))
+def _ends(scene: Scene) -> Int[np.ndarray, "links 2"]:
+    """Numbers of what each link joins: unknown poses, and one for all that is held."""
+    held, bodies = held_poses(scene, given=False), {}
+
+    def number(chain) -> int:
+        return bodies.setdefault(tuple(key for key in chain if key not in held), len(bodies))
+
+    return np.array([[number(link.a), number(link.b)] for link in link_relations(scene)])
+
+
+def _worst_at_both_ends(ends: Int[np.ndarray, "links 2"], value: np.ndarray) -> np.ndarray:
+    """Which links have the largest (positive) value among all links at both of their bodies."""
+    largest = np.zeros(int(ends.max(initial=-1)) + 1)
     for side in (0, 1):
         np.maximum.at(largest, ends[:, side], value)
-    return np.flatnonzero((value > 0.0) & (value >= largest[ends].max(axis=1)))
+    return (value > 0.0) & (value >= largest[ends].max(axis=1))
+
+
+def _without(ends: Int[np.ndarray, "links 2"], weights, value) -> Float[np.ndarray, " links"]:
+    """Weights without the links of positive value, the worst first, that the others can spare."""
+    weights, n = np.array(weights), int(ends.max(initial=-1)) + 1
+
+    def parts() -> int:
+        used = ends[weights > 0.0]
+        joined = coo_array((np.ones(len(used)), tuple(used.T)), (n, n))
+        return connected_components(joined, directed=False, return_labels=False)
+
+    before = parts()
+    for k in np.argsort(-value, kind="stable")[: int(np.sum(value > 0.0))]:
+        weights[k] = 0.0
+        if parts() > before:
+            weights[k] = 1.0
+    return weights
+
+
+def _where_link(scene: Scene, k: int) -> str:
+    links = scene.recording.links
+    assert links is not None
+    when = f", epoch {scene.recording.epoch_ids[links.epoch[k]]}" if links.epoch[k] >= 0 else ""
+    return f"link {links.name[k]}{when}"
 
 
 def robust_variance(adjustment: Adjustment) -> float:
