@@ -4,11 +4,13 @@ As numbers a pose is a 6-vector (turn, shift): a rotation vector (rad) and a tra
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxvm.geometry.rotations import (
     hat,
+    se3_coupling,
     so3_exp,
     so3_left_jacobian,
     so3_left_jacobian_inverse,
@@ -55,10 +57,29 @@ def se3_exp(twist: Float[Array, "6"]) -> Pose:
     return Pose(so3_exp(twist[:3]), so3_left_jacobian(twist[:3]) @ twist[3:])
 
 
+@jax.custom_jvp
 def se3_log(pose: Pose) -> Float[Array, "6"]:
     """Twist (omega, rho) of a pose: the full SE(3) logarithm."""
     omega = so3_log(pose.rotation)
     return jnp.concatenate([omega, so3_left_jacobian_inverse(omega) @ pose.shift])
+
+
+@se3_log.defjvp
+def _(primals, tangents):
+    """log(T exp(d)) = log(T) + J^-1(-log T) d, for changes that keep T a pose.
+
+    J^-1 [omega; rho] = [A omega; A (rho - Q A omega)] with A that of SO(3) (Barfoot 2017, 7.86).
+    """
+    (pose,), (change,) = primals, tangents
+    twist = se3_log(pose)
+    skew, along = pose.rotation.T @ change.rotation, pose.rotation.T @ change.shift
+    turn = 0.5 * jnp.stack(
+        [skew[2, 1] - skew[1, 2], skew[0, 2] - skew[2, 0], skew[1, 0] - skew[0, 1]]
+    )
+    inner = so3_left_jacobian_inverse(-twist[:3])
+    turned = inner @ turn
+    moved = inner @ (along - se3_coupling(-twist) @ turned)
+    return twist, jnp.concatenate([turned, moved])
 
 
 def se3_adjoint(pose: Pose) -> Float[Array, "6 6"]:

@@ -169,3 +169,26 @@ def so3_left_jacobian_inverse(turn: Float[Array, "3"]) -> Float[Array, "3 3"]:
     d = jnp.where(small, series, (1.0 - 0.5 * a / b) / safe)
     skew = hat(turn)
     return jnp.eye(3) - 0.5 * skew + d * (skew @ skew)
+
+
+def se3_coupling(twist: Float[Array, "6"]) -> Float[Array, "3 3"]:
+    """Q of a twist (omega, rho): the left Jacobian of SE(3) is [J, 0; Q, J] (Barfoot 2017, 7.86).
+
+    With W = hat(omega), P = hat(rho) its products of three and four are vectors' own: W P + P W =
+    omega rho^T + rho omega^T - 2 k, W P W = -k W, and so on, k = omega . rho.
+    """
+    omega, rho = twist[:3], twist[3:]
+    square, k = omega @ omega, omega @ rho
+    _, b, c = _sine_coefficients(square)
+    small = square < _SERIES
+    safe = jnp.where(small, 1.0, square)
+    d = jnp.where(small, _series(square, (24.0, 30.0, 56.0, 90.0)), (0.5 - b) / safe)
+    e = jnp.where(
+        small,
+        1.0 / 120.0 - square / 2520.0 + square**2 / 120960.0 - square**3 / 9979200.0,
+        0.5 * (3.0 * c - b) / safe,
+    )
+    mixed = omega[:, None] * rho[None, :]
+    own = omega[:, None] * omega[None, :]
+    skew = (0.5 - d * square) * hat(rho) + k * (2.0 * d - c) * hat(omega)
+    return skew + c * (mixed + mixed.T) - 2.0 * k * (e * own + (c - e * square) * jnp.eye(3))

@@ -1,9 +1,12 @@
 """Links of a scene: relative poses of stations along their lines, measured with a covariance."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from jaxvm.geometry.rotations import so3_left_jacobian
 from jaxvm.recording.recording import Links, uncorrelated
 from jaxvm.scenes.describe import LinkNoise
 from jaxvm.scenes.layouts import Structure
@@ -42,7 +45,8 @@ def measured_links(
     root = np.linalg.cholesky(covariance)
     twist = -noise * np.einsum("nij,nj->ni", root, rng.standard_normal((len(turn), 6)))
     omega, rho = twist[:, :3], twist[:, 3:]
-    moved = shift + np.einsum("nij,njk,nk->ni", turn, _left_jacobian(omega), rho)
+    bend = np.asarray(jax.vmap(so3_left_jacobian)(jnp.asarray(omega)))
+    moved = shift + np.einsum("nij,njk,nk->ni", turn, bend, rho)
     measured = (Rotation.from_matrix(turn) * Rotation.from_rotvec(omega)).as_rotvec()
     moves = placement.moving[ties.a] | placement.moving[ties.b]
     names = structure.names
@@ -69,18 +73,3 @@ def _covariance(
     found[:, :3, :3] = spread.sigma_rad**2 * (f**2 * np.eye(3) + (1.0 - f**2) * outer)
     found[:, 3:, 3:] = spread.sigma_m**2 * (np.eye(3) + (g**2 - 1.0) * outer)
     return found
-
-
-def _left_jacobian(omega: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
-    """J of exp(omega, rho) = (exp(omega), J rho), by its series: turns of noise are small.
-
-    Six terms of sum hat^k / (k+1)! are exact in double precision up to a hundredth of a radian.
-    """
-    hat = np.zeros((len(omega), 3, 3))
-    hat[:, [2, 0, 1], [1, 2, 0]] = omega
-    hat[:, [1, 2, 0], [2, 0, 1]] = -omega
-    term = total = np.tile(np.eye(3), (len(omega), 1, 1))
-    for k in range(2, 9):
-        term = term @ hat / k
-        total = total + term
-    return total
