@@ -226,6 +226,22 @@ def test_calibrations_of_a_station_fulfil_every_loop_and_scatter_as_predicted():
     np.testing.assert_allclose(product.shift, np.zeros(3), atol=1e-14)
 
 
+def test_links_may_differ_by_many_orders_of_magnitude():
+    """A ladder whose rungs are 1e6 times better than its rails: two bodies of a rung are one."""
+    n, sigma, better = 8, 1e-3, 1e-6
+    rails = [(k + r, k + r + 2) for k in range(0, 2 * n - 2, 2) for r in (0, 1)]
+    rungs = [(k, k + 1) for k in range(0, 2 * n, 2)]
+    pairs = np.array(rails + rungs)
+    size = np.where(np.arange(len(pairs)) < len(rails), sigma, sigma * better)
+    pose = np.zeros((len(pairs), 6))
+    links = Link(jnp.asarray(pose), jnp.asarray(size[:, None, None] ** 2 * np.eye(6)))
+    relay = adjust_relay(pairs, links)
+    spread = np.asarray(relay.between(0, 2 * n - 2).covariance)
+    # Without levers: n - 1 pairs of rails side by side, sigma^2 / 2 each.
+    np.testing.assert_allclose(spread, 0.5 * (n - 1) * sigma**2 * np.eye(6), rtol=1e-5, atol=1e-12)
+    assert float(relay.last) < 1e-6
+
+
 def test_what_no_link_joins_is_named():
     pairs, links = station(3)
     with pytest.raises(ValueError, match="no link joins right, rear to front"):

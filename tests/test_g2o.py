@@ -4,10 +4,17 @@ import gzip
 
 import numpy as np
 import pytest
+from networks import relay_recording
 from pose_networks import matrix, network
 
 from jaxvm.network.scene import build
-from jaxvm.recording import RecordingError, find_data, read_recording, write_recording
+from jaxvm.recording import (
+    RecordingError,
+    convert,
+    find_data,
+    read_recording,
+    write_recording,
+)
 from jaxvm.recording.g2o import import_g2o, write_g2o
 from jaxvm.solve.adjust import adjust
 
@@ -65,6 +72,10 @@ def test_full_covariances_survive_a_folder(tmp_path):
         ("7 1 2 3 0", "7 nan 2 3 0", r"line 2: a number is not finite"),
         ("4 1 0 0", "4 9 0 0", r"line 3: the information matrix is not positive definite"),
         ("EDGE_SE3:QUAT", "EDGE_SE2", r"line 3: EDGE_SE2 is not read here"),
+        ("QUAT 7 1 2 3 0", "QUAT 3 1 2 3 0", r"line 2: vertex 3 is there already"),
+        ("3 7 1 2", "7 7 1 2", r"line 3: the edge joins vertex 7 with itself"),
+        ("0 0 0 0 0 0 1\n", "0 0 0 0 0 0 0\n", r"line 1: the quaternion is zero"),
+        ("VERTEX_SE3:QUAT 7", "FIX 9\nVERTEX_SE3:QUAT 7", r"FIX 9 names a vertex that is not"),
     ],
 )
 def test_what_is_wrong_is_said_with_its_line(tmp_path, old, new, words):
@@ -83,6 +94,36 @@ def test_indefinite_information_can_be_mended(tmp_path):
     assert values.min() > 0.0
     # What was sound stays as it is.
     assert np.allclose(np.diagonal(covariance)[:3], 1.0 / np.array([7, 8, 9]))
+
+
+def test_what_can_not_be_mended_is_refused(tmp_path):
+    file = tmp_path / "bad.g2o"
+    file.write_text(SMALL.replace("4 1 0 0 0 0 5", "-4 0 0 0 0 0 -5").replace(" 6 0", " -6 0"))
+    with pytest.raises(RecordingError, match=r"line 3: .*--mend"):
+        import_g2o(file)
+    negative = " ".join(f"{-1.0 * (i == j)}" for i in range(6) for j in range(i, 6))
+    head = SMALL.rpartition("0.7071067811865476")[0] + "0.7071067811865476 "
+    file.write_text(head + negative + "\n")
+    with pytest.raises(RecordingError, match=r"line 3: .*no positive eigenvalue"):
+        import_g2o(file, mend=True)
+    cut = gzip.compress(SMALL.encode())[:-12]
+    (tmp_path / "cut.g2o.gz").write_bytes(cut)
+    with pytest.raises(RecordingError, match="is the file whole"):
+        import_g2o(tmp_path / "cut.g2o.gz")
+
+
+def test_nothing_is_lost_or_overwritten(tmp_path):
+    file = tmp_path / "out.g2o"
+    with pytest.raises(ValueError, match="image points and ranges would be lost"):
+        write_g2o(relay_recording().recording, file)
+    assert not file.exists()
+    source = tmp_path / "in.g2o"
+    source.write_text(SMALL)
+    convert(source, file)
+    before = file.read_bytes()
+    with pytest.raises(FileExistsError, match="already there"):
+        convert(source, file)
+    assert file.read_bytes() == before
 
 
 def test_a_peer_reaches_the_same_optimum():

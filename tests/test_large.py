@@ -15,6 +15,7 @@ from scipy.stats import chi2
 
 from jaxvm.network.chordal import chordal_poses
 from jaxvm.network.cycles import fundamental_cycles
+from jaxvm.network.draw import drawn
 from jaxvm.network.graph import (
     PoseGraph,
     UnconnectedNetwork,
@@ -25,6 +26,7 @@ from jaxvm.network.relations import held_poses, link_relations, pose_graph
 from jaxvm.network.scene import build
 from jaxvm.network.start import start
 from jaxvm.physics.effects import Effect, Term
+from jaxvm.recording.model import Prior
 from jaxvm.scenes import parse_description, simulate_network
 from jaxvm.solve import adjust as adjusting
 from jaxvm.solve import covariance as covariances
@@ -248,6 +250,24 @@ def test_gross_errors_are_named(known, size):
     assert found.degrees_of_freedom == 6 * (len(GRID) - len(bad)) - 6 * (N - 1)
 
 
+def test_what_nothing_checks_is_not_set_aside(known):
+    """Two gross errors far apart on one loop: without both the loop would fall in two."""
+    ring = [(k, (k + 1) % 8) for k in range(8)]
+    recording = network(ring, 8, seed=3).recording
+    pose = recording.links.pose.copy()
+    for k in (1, 5):
+        pose[k, 3:] += 1.0
+    scene = build(replace(recording, links=replace(recording.links, pose=pose)))
+    found, rejected, weights = snoop_links(scene)
+    assert len(rejected) == 1 and found.converged
+    assert found.degrees_of_freedom == 0 and found.variance_factor == 1.0
+    # Sigmas that are ten times too small: sound links stay where the scale says so.
+    small = replace(known.recording.links, covariance=known.recording.links.covariance / 100.0)
+    scene = build(replace(known.recording, links=small))
+    assert snoop_links(scene, scale=100.0)[1] == []
+    assert len(snoop_links(scene)[1]) > 0
+
+
 def test_sound_networks_keep_their_links():
     lost = 0
     for seed in range(8):
@@ -322,6 +342,21 @@ def test_descents_reach_the_same_minimum(known, method, rel):
 def test_an_unknown_method_is_named(known):
     with pytest.raises(ValueError, match='no method "newton".*spgd, lbfgs'):
         adjust(build(known.recording), "newton")
+
+
+def test_priors_are_drawn_about_the_state_too(known):
+    """What is known beforehand is an observation: its error counts in the predicted covariance."""
+    sigma = np.repeat([1e-3, 2e-2], 3)
+    prior = Prior("stations.s3.pose", known.truth[3] + 7.0 * sigma, sigma)
+    recording = replace(known.recording, model=replace(known.recording.model, priors=(prior,)))
+    scene = build(recording)
+    state = eqx.tree_at(lambda s: s.world_from_station, scene.state, jnp.asarray(known.truth))
+    keys = jax.random.split(jax.random.key(0), 400)
+    drawing = jax.jit(jax.vmap(lambda key: drawn(scene.network, state, key).priors.expected))
+    expected = np.asarray(drawing(keys))
+    off = (expected - known.truth[3]) / sigma
+    assert np.abs(off.mean(axis=0)).max() < 4.0 / np.sqrt(400)
+    assert np.abs(off.std(axis=0) - 1.0).max() < 4.0 / np.sqrt(800)
 
 
 def test_hidden_physics_shows_in_monte_carlo():

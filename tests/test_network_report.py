@@ -142,6 +142,8 @@ def test_cycles_and_links_are_tested(small):
         assert cycle["p_value"] == pytest.approx(chi2.sf(cycle["statistic"], 6))
         assert cycle["deviations"] ** 2 == pytest.approx(cycle["statistic"])
         assert set(cycle["bodies"]) in ({0, 1, 2}, {2, 3, 4})
+        # Three like edges: two thirds of the condition fall on the two of the tree.
+        assert cycle["effective"] and "67 % of its condition falls on the best" in cycle["effect"]
     statistics = [cycle["statistic"] for cycle in told["cycles"]]
     assert statistics == sorted(statistics, reverse=True)
     # Two separate triangles: each alone makes the residuals of its links; the cost is their sum.

@@ -232,6 +232,7 @@ def test_too_few_points(tmp_path):
         (put("links", 0, "turn_x", "90"), r"line 2: the turn has length 90, .*not degrees"),
         (put("links", 0, "sigma_m", "0"), r"line 2: sigma_m is 0"),
         (edit("links", lambda f: f[f.link != "c20"]), r'link "c20" of a closure is not'),
+        (edit("links", lambda f: f.assign(to=f["from"])), r"line 2: the link joins .* with itself"),
     ],
 )
 def test_wrong_links(change, message, tmp_path):

@@ -265,6 +265,18 @@ def test_deformation_is_recovered_epoch_by_epoch():
 
 
 @pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("epochs", [2, 3, 4, 6])
+def test_something_moves_whatever_the_number_of_epochs(mode, epochs):
+    text = f'layout = "ship"\n[time]\nepochs = {epochs}\n[deformation]\n{mode} = 0.1\n'
+    described = parse_description(text)
+    time = described.interval_s * np.arange(described.epochs)
+    far = np.array([[40.0, 1.0, 1.0]])
+    axis, origin = (1.0, 0.0, 0.0), np.zeros(3)
+    _, shift = displacements(far, axis, origin, {mode: 0.1}, time, described.period_s)
+    assert np.ptp(shift[0], axis=0).max() > 0.02
+
+
+@pytest.mark.parametrize("mode", MODES)
 def test_stations_turn_as_the_structure_does(mode):
     """A short arm on the structure moves with the turn of its station: dX = turn x arm."""
     rng = np.random.default_rng(3)

@@ -14,6 +14,7 @@ from networks import (
     without_starts,
 )
 
+from jaxvm.network import start as starting
 from jaxvm.network.scene import build
 from jaxvm.network.start import StartError, start
 from jaxvm.recording.model import Station, Target
@@ -141,3 +142,18 @@ def test_unseen_bodies_with_a_known_pose_need_no_view():
 def thinned(obs, keep):
     """The kept rows of the observations."""
     return type(obs)(**{name: values[keep] for name, values in vars(obs).items()})
+
+
+def test_the_best_start_does_without_a_way_that_fails(monkeypatch):
+    """A camera that is free on a free station is no edge of a pose graph; chains reach it."""
+    scene = build(relay_recording().recording)
+
+    def refused(*_):
+        raise StartError("no chain reaches it")
+
+    monkeypatch.setattr(starting, "_chordal", refused)
+    best, given = start(scene, "best"), start(scene, "given")
+    assert np.array_equal(best.state.flatten(), given.state.flatten())
+    monkeypatch.setattr(starting, "_chain", refused)
+    with pytest.raises(StartError, match="no chain reaches it"):
+        start(scene, "best")

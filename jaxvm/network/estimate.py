@@ -73,7 +73,7 @@ def pose_table(scene: Scene, deviations: State) -> pd.DataFrame:
         spread = np.asarray(getattr(deviations, table))
         for i, body in enumerate(bodies):
             moving = body.motion == "per-epoch"
-            frame = (kind == "target" and body.station) or "world"
+            frame = getattr(body, "station", "") or "world"
             for epoch in range(len(scene.recording.time)) if moving else (0,):
                 own = row_of[i, epoch]
                 when = str(scene.recording.epoch_ids[epoch]) if moving else ""

@@ -74,15 +74,16 @@ def residual(state: State, network: Network) -> Residuals:
     flat = state.flatten()
     values = courses(network.effects, state.constant, network.channels)
 
-    def block(factor: Factor | None):
-        if factor is None:
-            return None
+    def whitened(factor: Factor) -> Array:
         # What is set aside counts nothing, even where it can't be predicted at all.
         used = factor.weight[:, None] > 0.0
         return jnp.where(used, rows(factor, network, flat, values), 0.0) * whitening(factor)
 
+    def block(factor: Factor | None) -> Array | None:
+        return None if factor is None else whitened(factor)
+
     return Residuals(
-        tuple(map(block, network.pixels)),
+        tuple(map(whitened, network.pixels)),
         block(network.ranges),
         block(network.links),
         block(network.edges),

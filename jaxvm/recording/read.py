@@ -337,7 +337,7 @@ def _check_links(table: Table, model: Model, links: Links, n_epochs: int) -> Non
             own = model.cameras[number] if kind == "camera" else model.targets[number]
             carrier = stations.get(own.station)
         found = {carrier.name} if carrier and carrier.motion == "per-epoch" else set()
-        return found | ({own.name} if kind == "target" and own.motion == "per-epoch" else set())
+        return found | ({own.name} if getattr(own, "motion", "") == "per-epoch" else set())
 
     for row, (a, b, epoch) in enumerate(
         zip(links.from_node, links.to_node, links.epoch, strict=True)

@@ -14,7 +14,12 @@ from markupsafe import Markup
 from scipy.stats import chi2
 
 from jaxvm import __version__
-from jaxvm.network.cycles import fundamental_cycles, minimum_cycle_basis, misclosure
+from jaxvm.network.cycles import (
+    cycle_effects,
+    fundamental_cycles,
+    minimum_cycle_basis,
+    misclosure,
+)
 from jaxvm.network.graph import components, n_conditions, shortest_path_tree, unheld_parts
 from jaxvm.network.redundancy import HARDLY_CHECKED, WeakEdge
 from jaxvm.recording.files import write_files
@@ -196,9 +201,9 @@ def distances(bodies: BodyGraph) -> Int[np.ndarray, " nodes"]:
 
 def worst_deviation(covariance: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:
     """Standard deviation along the direction in which it is largest; NaN where it is not known."""
-    known = np.isfinite(covariance).all(axis=(1, 2))
-    values = np.linalg.eigvalsh(np.where(known[:, None, None], covariance, 0.0))
-    return np.where(known, np.sqrt(np.maximum(values.max(axis=1, initial=0.0), 0.0)), np.nan)
+    values = np.linalg.eigvalsh(np.nan_to_num(covariance))
+    worst = np.sqrt(np.maximum(values.max(axis=1, initial=0.0), 0.0))
+    return np.where(np.isfinite(covariance).all(axis=(1, 2)), worst, np.nan)
 
 
 def _bodies(adjustment: Adjustment, bodies: BodyGraph) -> list[dict[str, Any]]:
@@ -284,14 +289,20 @@ def _unobservable(bodies: BodyGraph) -> list[str]:
 
 
 def _cycles(bodies: BodyGraph) -> list[dict[str, Any]]:
-    """A cycle basis (of a large one the shortest cycles), the largest test statistic first."""
+    """A cycle basis (of a large one the shortest cycles), the largest test statistic first.
+
+    Of a minimum basis also whether each cycle improves the network, or only edges beside its best
+    tree.
+    """
     graph = bodies.graph
     if not graph.names:
         return []
     few = n_conditions(graph) <= _MINIMUM_BASIS
     basis = minimum_cycle_basis(graph) if few else fundamental_cycles(graph)
+    basis = sorted(basis, key=len)
+    effects = cycle_effects(graph, basis) if few else [None] * len(basis)
     result = []
-    for cycle in sorted(basis, key=len)[:_MOST_CYCLES]:
+    for cycle, effect in list(zip(basis, effects, strict=True))[:_MOST_CYCLES]:
         try:
             found = misclosure(graph, cycle)
         except ValueError:  # views without a pixel's worth of noise: there is nothing to test by
@@ -307,6 +318,8 @@ def _cycles(bodies: BodyGraph) -> list[dict[str, Any]]:
                 "statistic": float(found.statistic),
                 "deviations": float(np.sqrt(found.statistic)),
                 "p_value": found.p_value,
+                "effective": None if effect is None else effect.effective,
+                "effect": None if effect is None else effect.words(),
             }
         )
     return sorted(result, key=lambda cycle: -cycle["statistic"])

@@ -111,11 +111,11 @@ def first_scale(longest: Float[np.ndarray, " n"], size: float) -> float:
 
 def _pairs(bodies: BodyGraph, document: dict[str, Any]):
     """Edges that join the same two bodies, together; and the pair of each edge."""
-    place: dict[tuple[int, int, bool], int] = {}
+    place: dict[tuple[int, int], int] = {}
     pairs, of_edge = [], []
     for edge in document["edges"]:
         a, b = edge["from"], edge["to"]
-        key = (min(a, b), max(a, b), False)
+        key = (min(a, b), max(a, b))
         flags = BRIDGE * edge["bridge"] + SIGHT * (edge["kind"] == "sight")
         if key not in place:
             place[key] = len(pairs)

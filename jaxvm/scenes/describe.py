@@ -51,7 +51,7 @@ who see it; plates: a grid for each of them |
 | `bending_m`, `sway_m` | 0 | up and down, and to the sides, at the far end |
 | `settling_m` | 0 | down at the far end, for good |
 | `torsion_rad` | 0 | about the long axis, at the far end |
-| `period_s` | 4/3 of all epochs | of bending and torsion; sway has half of it |
+| `period_s` | 1.6 times all epochs | of bending and torsion; sway has half of it |
 | **[temperature]** | none | a day, logged in drivers.csv: |
 | `mean_degC`, `swing_K` | 15, 8 | of the air |
 | `rise_K` | 12 | of a camera's body above the air, when it has warmed up |
@@ -393,7 +393,7 @@ def _deformation(root: Entry, epochs: int, interval: float, layout: str):
     found = {key: entry.number(key, 0.0) or 0.0 for key in MODES}
     found = {key: size for key, size in found.items() if size != 0.0}
     # Longer than the recording: over two or four epochs of a whole period a sine may vanish.
-    period = entry.positive("period_s", 4.0 / 3.0 * epochs * interval)
+    period = entry.positive("period_s", 1.6 * epochs * interval)
     if "deformation" not in root:
         return {}, period
     if not found:

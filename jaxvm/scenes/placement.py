@@ -139,11 +139,6 @@ class Ties:
     b: Int[np.ndarray, " n"]
     epoch: Int[np.ndarray, " n"]
 
-    def and_(self, others: "Ties") -> "Ties":
-        """These and others."""
-        pairs = zip(vars(self).values(), vars(others).values(), strict=True)
-        return Ties(*(np.concatenate(pair) for pair in pairs))
-
 
 def check_joined(
     description: Description, structure: Structure, placement: Placement, ties: Ties
