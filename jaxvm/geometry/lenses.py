@@ -94,6 +94,21 @@ class BrownConrady(LensFamily):
         return jnp.append(jnp.where(seen, tangent, jnp.nan), 1.0)
 
 
+class Radial(BrownConrady):
+    """k1 and k2 alone, the lens of structure from motion (Snavely, Seitz & Szeliski 2006).
+
+    A point behind the camera is imaged through its centre, as the programs there do: among very
+    many points the start of some may be wrong, and an adjustment brings them to the front.
+    """
+
+    def __init__(self):
+        self.name = "radial"
+        self.n_coefficients = 2
+
+    def distort(self, coefficients, ray, extra=None):
+        return self._plane(coefficients, ray[:2] / ray[2], extra)
+
+
 class KannalaBrandt(LensFamily):
     """Fisheye: theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8).
 
@@ -193,7 +208,7 @@ def _invert(function, target):
     return jnp.where(found, polished, jnp.nan)
 
 
-LENS_NAMES = ("pinhole", "opencv4", "opencv5", "opencv8", "opencv12", "opencv14", "fisheye")
+LENS_NAMES = ("pinhole", "radial", "opencv4", "opencv5", "opencv8", "opencv12", "opencv14", "fisheye")
 """Names of lenses in a recording."""
 
 
@@ -204,6 +219,8 @@ def lens_family(name: str) -> LensFamily:
         raise ValueError(f'there is no lens "{name}" (there are: {", ".join(LENS_NAMES)})')
     if name == "fisheye":
         return KannalaBrandt()
+    if name == "radial":
+        return Radial()
     return BrownConrady(0 if name == "pinhole" else int(name.removeprefix("opencv")))
 
 

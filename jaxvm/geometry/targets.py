@@ -2,6 +2,7 @@
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import cKDTree
 
 
 def grid_points(rows: int, columns: int, spacing: float) -> Float[np.ndarray, "points 3"]:
@@ -19,8 +20,10 @@ def checker(points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, " points
     none = np.full(len(points), np.nan)
     if len(points) < 4 or not np.isfinite(points).all():
         return none
-    apart = np.linalg.norm(points[:, None] - points[None], axis=2)
-    spacing = np.median(np.where(apart > 0.0, apart, np.inf).min(axis=1))
+    distinct = np.unique(points, axis=0)
+    if len(distinct) < 2:
+        return none
+    spacing = np.median(cKDTree(distinct).query(distinct, k=2)[0][:, 1])
     step = (points[:, :2] - points[0, :2]) / spacing
     if np.abs(step - np.round(step)).max() > 0.05:
         return none

@@ -160,7 +160,7 @@ class Problem(eqx.Module):
     def assembled(self, tables: list[Linearised]) -> Normal:
         """The same of tables that are linearised already."""
         own = [factor.slots.shape[1] for factor in self.network.factors()]
-        return _assembled(tables, self.packets, own, self.loss, self.sizes)
+        return assemble(tables, self.packets, own, self.loss, self.sizes)
 
 
 def flat_state(problem: Problem, x: Float[Array, " n"]) -> tuple[Array, Array]:
@@ -202,7 +202,7 @@ def whitened(raw: list[Linearised], whiten, steps, per_parameter) -> list[Linear
 
 
 @eqx.filter_jit
-def _assembled(
+def assemble(
     tables: list[Linearised],
     packets_of: tuple[Packets, ...],
     own_slots: list[int],
