@@ -28,7 +28,6 @@ from jaxvm.network.start import start
 from jaxvm.physics.effects import Effect, Term
 from jaxvm.recording.model import Prior
 from jaxvm.scenes import parse_description, simulate_network
-from jaxvm.solve import adjust as adjusting
 from jaxvm.solve import covariance as covariances
 from jaxvm.solve import large, snooping
 from jaxvm.solve.adjust import adjust
@@ -46,7 +45,7 @@ from jaxvm.solve.sparse import Pattern, SparseFactors, SparseNormal, sparse_norm
 @pytest.fixture
 def sparsely(monkeypatch):
     """Whatever the size, networks are solved as large ones."""
-    for module in (large, adjusting, covariances, snooping):
+    for module in (large, covariances, snooping):
         monkeypatch.setattr(module, "is_large", lambda problem: True)
 
 
@@ -121,7 +120,7 @@ def test_selected_inverse_is_the_inverse(seed, n, density):
 def test_large_networks_are_adjusted_as_small_ones(known, method, monkeypatch):
     scene = build(known.recording)
     dense = adjust(scene, method)
-    for module in (large, adjusting, covariances, snooping):
+    for module in (large, covariances, snooping):
         monkeypatch.setattr(module, "is_large", lambda problem: True)
     sparse = adjust(scene, method)
     assert sparse.converged

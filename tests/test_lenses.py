@@ -34,7 +34,7 @@ BROWN = [
     -0.011,
 ]
 FISHEYE = np.array([0.02, -0.006, 0.002, -0.0003])
-PERSPECTIVE = [name for name in LENS_NAMES if name != "fisheye"]
+PERSPECTIVE = [name for name in LENS_NAMES if name not in ("fisheye", "radial")]
 
 
 def coefficients(name):
@@ -105,6 +105,15 @@ def test_perspective_lenses_undistort_like_opencv(name):
     rays = np.asarray(batched(name)[1](c, pixels))
     got = FOCAL * rays[:, :2] / rays[:, 2:] + CENTRE
     np.testing.assert_allclose(got, expected, rtol=0, atol=1e-9)
+
+
+def test_the_radial_lens_is_opencvs_with_two_coefficients():
+    """And what lies behind the camera is imaged through its centre."""
+    c, points = coefficients("opencv4")[:2], points_before_camera()
+    got = batched("radial")[0](c, points)
+    same = batched("opencv4")[0](np.append(c, np.zeros(2)), points)
+    np.testing.assert_allclose(got, same, rtol=1e-13)
+    np.testing.assert_allclose(batched("radial")[0](c, -points), got, rtol=1e-12)
 
 
 def test_fisheye_projects_like_opencv():
@@ -304,7 +313,9 @@ def test_family_by_name():
         assert lens_family(name).name == name
     assert isinstance(lens_family("fisheye"), KannalaBrandt)
     assert lens_family("opencv8") == BrownConrady(8)
-    assert [lens_family(name).n_coefficients for name in LENS_NAMES] == [0, 4, 5, 8, 12, 14, 4]
+    assert [lens_family(name).n_coefficients for name in LENS_NAMES] == [
+        0, 2, 4, 5, 8, 12, 14, 4
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("name", ["opencv6", "Fisheye", "", "opencv", "tele"])

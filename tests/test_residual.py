@@ -23,9 +23,9 @@ from networks import (
 from scipy.linalg import logm
 
 from jaxvm.network.factors import PixelFactor, RangeFactor
-from jaxvm.network.residual import linearise, residual, whitening
+from jaxvm.network.residual import linearise, present, residual, whitening
 from jaxvm.network.scene import build
-from jaxvm.physics.effects import Effect, Scope, Term, course_slopes, courses
+from jaxvm.physics.effects import Effect, Scope, Term
 from jaxvm.physics.ports import N_PORTS, PORTS
 from jaxvm.recording.model import Prior
 
@@ -51,10 +51,7 @@ def forward_jacobian(flat, network):
 
 def linearised(factor, network, flat, live=(), tangent=False):
     """A table with its derivatives."""
-    constant = network.layout.restore(flat).constant
-    values = courses(network.effects, constant, network.channels)
-    slopes = course_slopes(network.effects, constant, network.channels)
-    return linearise(factor, network, flat, values, slopes, live, tangent)
+    return linearise(factor, network, present(network, flat), live, tangent)
 
 
 @eqx.filter_jit

@@ -208,7 +208,16 @@ def _invert(function, target):
     return jnp.where(found, polished, jnp.nan)
 
 
-LENS_NAMES = ("pinhole", "radial", "opencv4", "opencv5", "opencv8", "opencv12", "opencv14", "fisheye")
+LENS_NAMES = (
+    "pinhole",
+    "radial",
+    "opencv4",
+    "opencv5",
+    "opencv8",
+    "opencv12",
+    "opencv14",
+    "fisheye",
+)
 """Names of lenses in a recording."""
 
 

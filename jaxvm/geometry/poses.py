@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxvm.geometry.rotations import (
+    cross,
     hat,
     se3_coupling,
     so3_exp,
@@ -28,13 +29,25 @@ class Pose(eqx.Module):
         """a_from_c = a_from_b @ b_from_c."""
         return Pose(self.rotation @ other.rotation, self.rotation @ other.shift + self.shift)
 
+    def settled(self) -> "Pose":
+        """The pose as a rotation and a shift alone."""
+        return self
+
     def inverse(self) -> "Pose":
         """b_from_a of a_from_b."""
         return Pose(self.rotation.T, -(self.rotation.T @ self.shift))
 
+    def rotate(self, vector: Float[Array, "3"]) -> Float[Array, "3"]:
+        """A direction in the other frame."""
+        return self.rotation @ vector
+
     def apply(self, point: Float[Array, "3"]) -> Float[Array, "3"]:
         """Coordinates (m) of a point in the other frame."""
-        return self.rotation @ point + self.shift
+        return self.rotate(point) + self.shift
+
+    def unapply(self, point: Float[Array, "3"]) -> Float[Array, "3"]:
+        """Coordinates (m) back in this frame, as `inverse().apply` gives them."""
+        return self.rotation.T @ (point - self.shift)
 
     @classmethod
     def identity(cls) -> "Pose":
@@ -42,9 +55,41 @@ class Pose(eqx.Module):
         return cls(jnp.eye(3), jnp.zeros(3))
 
 
-def pose_from_vector(vector: Float[Array, "6"]) -> Pose:
-    """Pose of (turn, shift): rotation exp(turn), translation shift (not the SE(3) exponential)."""
-    return Pose(so3_exp(vector[:3]), vector[3:])
+class TurnedPose(Pose):
+    """A pose with a small turn behind it, exp(turn) rotation to first order.
+
+    What derivatives by a pose cost is what it does to a point: a cross product, not nine numbers.
+    """
+
+    turn: Float[Array, "3"]
+
+    def settled(self) -> Pose:
+        return Pose(self.rotation + hat(self.turn) @ self.rotation, self.shift)
+
+    def __matmul__(self, other: Pose) -> Pose:
+        return self.settled() @ other
+
+    def __rmatmul__(self, other: Pose) -> Pose:
+        return other @ self.settled()
+
+    def inverse(self) -> Pose:
+        return self.settled().inverse()
+
+    def rotate(self, vector: Float[Array, "3"]) -> Float[Array, "3"]:
+        still = self.rotation @ vector
+        return still + cross(self.turn, still)
+
+    def unapply(self, point: Float[Array, "3"]) -> Float[Array, "3"]:
+        away = point - self.shift
+        return self.rotation.T @ (away - cross(self.turn, away))
+
+
+def pose_from_vector(vector: Float[Array, "6"] | Pose) -> Pose:
+    """Pose of (turn, shift): rotation exp(turn), translation shift (not the SE(3) exponential).
+
+    What is a pose already stays as it is.
+    """
+    return vector if isinstance(vector, Pose) else Pose(so3_exp(vector[:3]), vector[3:])
 
 
 def vector_from_pose(pose: Pose) -> Float[Array, "6"]:

@@ -67,11 +67,12 @@ def _(primals, tangents):
 def rotate(turn: Float[Array, "3"], vector: Float[Array, "3"]) -> Float[Array, "3"]:
     """so3_exp(turn) @ vector without the matrix: v + a w x v + b w x (w x v)."""
     a, b, _ = _sine_coefficients(turn @ turn)
-    once = _cross(turn, vector)
-    return vector + a * once + b * _cross(turn, once)
+    once = cross(turn, vector)
+    return vector + a * once + b * cross(turn, once)
 
 
-def _cross(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
+def cross(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
+    """a x b, by components."""
     return jnp.stack(
         [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
     )

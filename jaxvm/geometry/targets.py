@@ -2,7 +2,7 @@
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 
 def grid_points(rows: int, columns: int, spacing: float) -> Float[np.ndarray, "points 3"]:
@@ -23,7 +23,7 @@ def checker(points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, " points
     distinct = np.unique(points, axis=0)
     if len(distinct) < 2:
         return none
-    spacing = np.median(cKDTree(distinct).query(distinct, k=2)[0][:, 1])
+    spacing = np.median(KDTree(distinct).query(distinct, k=2)[0][:, 1])
     step = (points[:, :2] - points[0, :2]) / spacing
     if np.abs(step - np.round(step)).max() > 0.05:
         return none

@@ -9,9 +9,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxvm.geometry.poses import pose_from_vector, se3_exp, vector_from_pose
 from jaxvm.network.factors import Factor, LinkFactor, link_pose
-from jaxvm.network.residual import Network, parts_of, rows
+from jaxvm.network.residual import Network, parts_of, present, rows
 from jaxvm.network.state import State
-from jaxvm.physics.effects import courses
 
 
 def drawn(network: Network, state: State, key: PRNGKeyArray, scale: float = 1.0) -> Network:
@@ -22,13 +21,13 @@ def drawn(network: Network, state: State, key: PRNGKeyArray, scale: float = 1.0)
     apply.
     """
     flat = state.flatten()
-    values = courses(network.effects, state.constant, network.channels)
+    at = present(network, flat)
     keys = iter(jax.random.split(key, len(network.pixels) + 4))
 
     def off(factor: Factor) -> Float[Array, "observations components"]:
         """Predicted minus measured, plus noise."""
         noise = jax.random.normal(next(keys), factor.sigma.shape)
-        return rows(factor, network, flat, values) + scale * factor.sigma * noise
+        return rows(factor, network, at) + scale * factor.sigma * noise
 
     pixels = tuple(
         eqx.tree_at(

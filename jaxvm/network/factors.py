@@ -49,7 +49,7 @@ class Factor(eqx.Module):
     @property
     @abc.abstractmethod
     def widths(self) -> tuple[int, ...]:
-        """How many slots each parameter has: a focal length 2, a pose 6, a point 3."""
+        """How many slots each parameter has: a focal length 2, a point 3; six are a pose."""
 
     def bare(self) -> "Factor":
         """The table without what the effects add to it."""
@@ -61,7 +61,10 @@ class Factor(eqx.Module):
 
     @abc.abstractmethod
     def local(self, own, data, ports: PortValues) -> Float[Array, " components"]:
-        """Predicted minus measured of one observation, in its unit."""
+        """Predicted minus measured of one observation, in its unit.
+
+        `own` are the values of its parameters, poses as `Pose` or as numbers.
+        """
 
 
 class PixelFactor(Factor):
@@ -199,7 +202,8 @@ class ClosureFactor(Factor):
         return (6,) * (self.slots.shape[1] // 6)
 
     def local(self, own, data, ports):
-        links = jax.vmap(pose_from_vector)(jnp.stack(own))
+        poses = [pose_from_vector(part).settled() for part in own]
+        links = jax.tree.map(lambda *each: jnp.stack(each), *poses)
         back = jax.vmap(Pose.inverse)(links)
         ahead = data > 0.0
         walked = Pose(

@@ -12,6 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxvm.geometry.poses import Pose, TurnedPose
+from jaxvm.geometry.rotations import so3_exp, so3_left_jacobian
 from jaxvm.network.factors import (
     ClosureFactor,
     EdgeFactor,
@@ -23,7 +25,7 @@ from jaxvm.network.factors import (
 )
 from jaxvm.network.state import Layout, State
 from jaxvm.physics.blocks import by_blocks, hosted, roomy
-from jaxvm.physics.effects import Channels, EffectTable, courses
+from jaxvm.physics.effects import Channels, EffectTable, course_slopes, courses
 from jaxvm.physics.ports import N_PORTS, PortValues
 
 
@@ -71,13 +73,12 @@ def residual(state: State, network: Network) -> Residuals:
     Pure and differentiable in every field of `state`; `jax.vmap` and `jax.jit` apply. Called
     outside of them it is computed in compiled blocks (`jaxvm.physics.blocks`).
     """
-    flat = state.flatten()
-    values = courses(network.effects, state.constant, network.channels)
+    at = present(network, state.flatten())
 
     def whitened(factor: Factor) -> Array:
         # What is set aside counts nothing, even where it can't be predicted at all.
         used = factor.weight[:, None] > 0.0
-        return jnp.where(used, rows(factor, network, flat, values), 0.0) * whitening(factor)
+        return jnp.where(used, rows(factor, network, at), 0.0) * whitening(factor)
 
     def block(factor: Factor | None) -> Array | None:
         return None if factor is None else whitened(factor)
@@ -97,29 +98,61 @@ def whitening(factor: Factor) -> Float[Array, "observations components"]:
     return factor.weight[:, None] / factor.sigma
 
 
-def rows(
-    factor: Factor,
-    network: Network,
-    flat: Float[Array, " n"],
-    values: Float[Array, "columns views"],
-) -> Float[Array, "observations components"]:
+class Present(NamedTuple):
+    """What all observations share of a state: its poses as rotations, the courses of its effects.
+
+    Attributes:
+        flat: the state.
+        rotation: of each pose.
+        lever: left Jacobian of each rotation: exp(turn + d) = exp(lever d) exp(turn).
+        values, slopes: of the courses of the effects' columns, and by their constants.
+    """
+
+    flat: Float[Array, " n"]
+    rotation: Float[Array, "poses 3 3"]
+    lever: Float[Array, "poses 3 3"]
+    values: Float[Array, "columns views"]
+    slopes: Float[Array, "columns views 2"]
+
+
+def present(network: Network, flat: Float[Array, " n"]) -> Present:
+    """A state as observations need it, each pose turned into a rotation once."""
+    constant = flat[network.layout.all("constant")]
+    (table,) = hosted(flat[: 6 * network.layout.n_poses])
+    rotation, lever = by_blocks(_rotations, table.reshape(-1, 6)[:, :3])
+    return Present(
+        flat,
+        rotation,
+        lever,
+        courses(network.effects, constant, network.channels),
+        course_slopes(network.effects, constant, network.channels),
+    )
+
+
+@jax.jit
+def _rotations(turns):
+    return jax.vmap(so3_exp)(turns), jax.vmap(so3_left_jacobian)(turns)
+
+
+def rows(factor: Factor, network: Network, at: Present) -> Float[Array, "observations components"]:
     """Predicted minus measured of one table, in its unit."""
-    return _chained(_values, factor, flat, _ports(factor, _acting(network, flat, values)))
+    return _chained(_values, factor, at, _ports(factor, _acting(network, at)))
 
 
-def _chained(function, factor: Factor, flat, ports):
+def _chained(function, factor: Factor, at: Present, ports):
     """A function of a table, the flat state and the port values of each row, block by block.
 
     It knows nothing of effects, so their number changes no program of the chain.
     """
     n = factor.slots.shape[0]
     ports = np.zeros((n, 0)) if ports is None else ports
-    return by_blocks(partial(_apart, function), (factor.bare(), ports), roomy(flat))
+    shared = tuple(map(roomy, (at.flat, at.rotation, at.lever)))
+    return by_blocks(partial(_apart, function), (factor.bare(), ports), shared)
 
 
-def _apart(function, table, flat):
+def _apart(function, table, shared):
     factor, ports = table
-    return function(factor, flat, ports if ports.shape[1] else None)
+    return function(factor, shared, ports if ports.shape[1] else None)
 
 
 class Acting(NamedTuple):
@@ -130,24 +163,59 @@ class Acting(NamedTuple):
     value: Float[Array, "columns views"]
 
 
-def _acting(network: Network, flat, values) -> Acting:
+def _acting(network: Network, at: Present) -> Acting:
     """With spare views, so that a recording of another length is no other program."""
-    (flat,) = hosted(flat)
+    (flat,) = hosted(at.flat)
     amplitude = flat[network.layout.all("amplitude")]
-    return Acting(amplitude, network.effects.ports, roomy(values, axis=1))
+    return Acting(amplitude, network.effects.ports, roomy(at.values, axis=1))
 
 
 def parts_of(factor: Factor, flat: Float[Array, " n"]) -> tuple[Float[Array, "n part"], ...]:
     """Values at the slots of a table, one array for each parameter."""
+    return tuple(flat[slots] for slots in _slots_of_parts(factor))
+
+
+def _slots_of_parts(factor: Factor):
     ends = np.cumsum(factor.widths)
     pieces = zip(ends - np.array(factor.widths), ends, strict=True)
-    return tuple(flat[factor.slots[:, a:b]] for a, b in pieces)
+    return [factor.slots[:, a:b] for a, b in pieces]
+
+
+class _Pose(NamedTuple):
+    """A pose that is a parameter: derivatives are those by its six numbers."""
+
+    pose: Pose
+    lever: Float[Array, "3 3"]
+
+    def changed(self, change: Float[Array, "6"]) -> Pose:
+        """To first order: exp(turn + d) = exp(lever d) exp(turn)."""
+        rotation, shift = self.pose.rotation, self.pose.shift + change[3:]
+        return TurnedPose(rotation, shift, self.lever @ change[:3])
+
+
+def _own(factor: Factor, shared) -> list:
+    """Values of a table's parameters, poses as rotations and shifts."""
+    flat, rotation, lever = shared
+    found = []
+    for slots in _slots_of_parts(factor):
+        if slots.shape[1] == 6:
+            k = slots[:, 0] // 6
+            found.append(_Pose(Pose(rotation[k], flat[slots[:, 3:]]), lever[k]))
+        else:
+            found.append(flat[slots])
+    return found
 
 
 @eqx.filter_jit
-def _values(factor: Factor, flat, ports) -> Float[Array, "observations components"]:
-    local = jax.vmap(lambda own, data, ports: factor.local(own, data, PortValues(ports)))
-    return local(parts_of(factor, flat), factor.data(), ports)
+def _values(factor: Factor, shared, ports) -> Float[Array, "observations components"]:
+    def local(own, data, ports):
+        return factor.local(list(map(_still, own)), data, PortValues(ports))
+
+    return jax.vmap(local)(_own(factor, shared), factor.data(), ports)
+
+
+def _still(part):
+    return part.pose if isinstance(part, _Pose) else part
 
 
 def _ports(factor: Factor, acting: Acting) -> Float[Array, "observations ports"] | None:
@@ -174,9 +242,7 @@ class Linearised(NamedTuple):
 def linearise(
     factor: Factor,
     network: Network,
-    flat: Float[Array, " n"],
-    values: Float[Array, "columns views"],
-    slopes: Float[Array, "columns views 2"],
+    at: Present,
     live: tuple[int, ...],
     tangent: bool = False,
 ) -> Linearised:
@@ -188,13 +254,13 @@ def linearise(
     the tangent is computed when it is asked for, else it is empty.
     """
     layout, n_own = network.layout, factor.slots.shape[1]
-    acting = _acting(network, flat, values)
+    acting = _acting(network, at)
     ports = _ports(factor, acting)
     affected = ports is not None
     if tangent and not affected and isinstance(factor, PixelFactor | RangeFactor):
         ports = np.zeros((factor.slots.shape[0], N_PORTS))
     own = tuple(at for at in live if at < n_own)
-    value, by_own, by_ports = _chained(partial(_derivatives, live=own), factor, flat, ports)
+    value, by_own, by_ports = _chained(partial(_derivatives, live=own), factor, at, ports)
     wanted = tuple(at - n_own for at in live if at >= n_own)
     if not affected or not wanted:
         by_effects = jnp.zeros((*value.shape, len(wanted)))
@@ -202,7 +268,7 @@ def linearise(
         assert isinstance(factor, PixelFactor | RangeFactor)
         owner = _owners(network.effects, len(layout.all("constant")))
         table = (by_ports, factor.view, factor.pattern)
-        by_effects = by_blocks(_by_effects, table, acting, roomy(slopes, axis=1), owner)
+        by_effects = by_blocks(_by_effects, table, acting, roomy(at.slopes, axis=1), owner)
         by_effects = by_effects[:, :, np.asarray(wanted)]
     joined: Any = np if isinstance(by_own, np.ndarray) else jnp
     return Linearised(value, joined.concatenate([by_own, by_effects], axis=2), by_ports)
@@ -230,10 +296,10 @@ def _by_effects(table, acting: Acting, slopes, owner):
 
 
 @eqx.filter_jit
-def _derivatives(factor: Factor, flat, ports, live: tuple[int, ...]):
+def _derivatives(factor: Factor, shared, ports, live: tuple[int, ...]):
     """Values of the rows, and their derivatives by live slots of their own and by all ports."""
-    parts = parts_of(factor, flat)
-    ends = np.cumsum([part.shape[1] for part in parts])
+    parts = _own(factor, shared)
+    ends = np.cumsum(factor.widths)
     first = np.concatenate([[0], ends])[:-1]
     # Only parameters with a wanted slot are differentiated; the others are constants.
     moving = [k for k in range(len(ends)) if any(first[k] <= at < ends[k] for at in live)]
@@ -241,15 +307,17 @@ def _derivatives(factor: Factor, flat, ports, live: tuple[int, ...]):
     wanted = jnp.asarray(np.searchsorted(within, np.asarray(live, int)), int)
 
     def local(free, ports, parts, data):
-        own = list(parts)
-        for k, value in zip(moving, free, strict=True):
-            own[k] = value
+        own = list(map(_still, parts))
+        for k, change in zip(moving, free, strict=True):
+            part = parts[k]
+            own[k] = part.changed(change) if isinstance(part, _Pose) else part + change
         value = factor.local(own, data, PortValues(ports))
         return value, value
 
-    free = [parts[k] for k in moving]
+    n = factor.slots.shape[0]
+    free = [jnp.zeros((n, factor.widths[k])) for k in moving]
     if not free and ports is None:
-        value = _values(factor, flat, None)
+        value = _values(factor, shared, None)
         return value, *(2 * (jnp.zeros((*value.shape, 0)),))
     derivative = jax.vmap(jax.jacrev(local, argnums=(0, 1), has_aux=True))
     (blocks, by_ports), value = derivative(free, ports, parts, factor.data())
@@ -260,6 +328,5 @@ def _derivatives(factor: Factor, flat, ports, live: tuple[int, ...]):
 
 def predict_pixels(state: State, network: Network) -> tuple[Float[Array, "observations 2"], ...]:
     """Predicted pixels (px) of every table: what a simulation adds its noise to."""
-    flat = state.flatten()
-    values = courses(network.effects, state.constant, network.channels)
-    return tuple(rows(f, network, flat, values) + f.circumstances.pixel for f in network.pixels)
+    at = present(network, state.flatten())
+    return tuple(rows(f, network, at) + f.circumstances.pixel for f in network.pixels)

@@ -73,7 +73,7 @@ class Scene:
             (jnp.asarray(amplitude), jnp.asarray(constant)),
         )
         network = eqx.tree_at(lambda n: n.effects, self.network, table)
-        network = _relaid(network, self.network.layout, Layout.of(state))
+        network = replace(network, layout=Layout.of(state))
         scene = replace(self, effects=effects, state=state, network=network)
         return bind(replace(scene, unknowns=free_unknowns(scene)))
 
@@ -247,23 +247,3 @@ def _in_room(points: np.ndarray) -> np.ndarray:
     """Points with spare rows, so that some marks more or less are no other program."""
     spare = -len(points) % 32
     return np.concatenate([points, np.zeros((spare, 3))])
-
-
-def _relaid(network: Network, old: Layout, new: Layout) -> Network:
-    """The network for a state whose effect tables changed in size: slots behind them move."""
-    moved = new.offset("identity") - old.offset("identity")
-
-    def shift(slots):
-        return jnp.where(slots >= old.offset("identity"), slots + moved, slots)
-
-    def relaid(factor):
-        return None if factor is None else replace(factor, slots=shift(factor.slots))
-
-    return replace(
-        network,
-        pixels=tuple(map(relaid, network.pixels)),
-        ranges=relaid(network.ranges),
-        links=relaid(network.links),
-        closures=relaid(network.closures),
-        layout=new,
-    )

@@ -17,20 +17,20 @@ N_DISTORTION = 14
 
 
 class State(eqx.Module):
-    """Values of all parameters, free or held."""
+    """Values of all parameters, free or held. Poses come first: pose k begins at 6 k."""
 
-    focal: Float[Array, "cameras 2"]  # px
-    centre: Float[Array, "cameras 2"]  # px
-    distortion: Float[Array, "cameras 14"]  # OpenCV's order
     station_from_camera: Float[Array, "cameras 6"]
     world_from_station: Float[Array, "station_rows 6"]
     carrier_from_target: Float[Array, "target_rows 6"]  # carrier: its station, else the world
-    point: Float[Array, "points 3"]  # target coordinates, m
     station_from_rangefinder: Float[Array, "rangefinders 6"]
     link: Float[Array, "closed_links 6"]  # relative poses that take part in loop closures
+    identity: Float[Array, "1 6"]  # pose of the world, and of a node that is its own carrier
+    focal: Float[Array, "cameras 2"]  # px
+    centre: Float[Array, "cameras 2"]  # px
+    distortion: Float[Array, "cameras 14"]  # OpenCV's order
+    point: Float[Array, "points 3"]  # target coordinates, m
     amplitude: Float[Array, " columns"]  # of effects
     constant: Float[Array, " constants"]  # of effects; the last is always 1
-    identity: Float[Array, "1 6"]  # pose of the world, and of a node that is its own carrier
 
     def flatten(self) -> Float[Array, " n"]:
         """All values as one vector, in the order of the fields."""
@@ -61,6 +61,11 @@ class Layout:
                 return total
             total += int(np.prod(shape))
         raise KeyError(name)
+
+    @property
+    def n_poses(self) -> int:
+        """Number of poses; they come first."""
+        return self.offset("focal") // 6
 
     @property
     def size(self) -> int:

@@ -21,15 +21,15 @@ WINDOW_INDEX = 1.52
 
 
 class Sight(NamedTuple):
-    """The unknowns that one observation touches, gathered from the state."""
+    """The unknowns that one observation touches, gathered from the state; poses in either form."""
 
     focal: Float[Array, "2"]
     centre: Float[Array, "2"]
     distortion: Float[Array, " coefficients"]
-    station_from_camera: Float[Array, "6"]
-    world_from_station: Float[Array, "6"]
-    world_from_carrier: Float[Array, "6"]  # of the target: a station, or the world itself
-    carrier_from_target: Float[Array, "6"]
+    station_from_camera: Float[Array, "6"] | Pose
+    world_from_station: Float[Array, "6"] | Pose
+    world_from_carrier: Float[Array, "6"] | Pose  # of the target: a station, or the world itself
+    carrier_from_target: Float[Array, "6"] | Pose
     point: Float[Array, "3"]
 
     @property
@@ -93,7 +93,8 @@ def mark(
 
 
 def place(
-    world_from_target: Pose,
+    world_from_carrier: Pose,
+    carrier_from_target: Pose,
     mark_target: Float[Array, "3"],
     delay: Float[Array, ""] | float,
     velocity: Float[Array, "6"],
@@ -103,12 +104,13 @@ def place(
 
     The target turns about its own origin and about axes parallel to the world's.
     """
-    arm = world_from_target.rotation @ mark_target
     if ports.plain:
-        return arm + world_from_target.shift
+        return world_from_carrier.apply(carrier_from_target.apply(mark_target))
+    arm = world_from_carrier.rotate(carrier_from_target.rotate(mark_target))
+    origin = world_from_carrier.apply(carrier_from_target.shift)
     turn = ports.axes("structure.turn") + delay * velocity[3:]
     shift = ports.axes("structure.shift") + delay * velocity[:3]
-    return rotate(turn, arm) + world_from_target.shift + shift
+    return rotate(turn, arm) + origin + shift
 
 
 def exposure_delay(
@@ -134,8 +136,8 @@ def look(
     ports: PortValues,
 ) -> Float[Array, "3"]:
     """Mark in camera coordinates (m). Station and camera turn and move about their own axes."""
-    seen_by_station = _disturb(world_from_station.inverse().apply(mark_world), "station", ports)
-    return _disturb(station_from_camera.inverse().apply(seen_by_station), "mount", ports)
+    seen_by_station = _disturb(world_from_station.unapply(mark_world), "station", ports)
+    return _disturb(station_from_camera.unapply(seen_by_station), "mount", ports)
 
 
 def _disturb(point: Float[Array, "3"], body: str, ports: PortValues) -> Float[Array, "3"]:
@@ -229,7 +231,8 @@ def predict_pixel(
     at = circumstances
     target = mark(sight.point, at.target_centre, at.target_half_size, ports)
     delay = exposure_delay(at.pixel, at.image_height, ports)
-    world = place(sight.world_from_target, target, delay, at.velocity, ports)
+    carrier, own = map(pose_from_vector, (sight.world_from_carrier, sight.carrier_from_target))
+    world = place(carrier, own, target, delay, at.velocity, ports)
     camera = look(
         pose_from_vector(sight.world_from_station),
         pose_from_vector(sight.station_from_camera),
@@ -246,12 +249,12 @@ def predict_pixel(
 
 
 class Aim(NamedTuple):
-    """The unknowns that one range touches, gathered from the state."""
+    """The unknowns that one range touches, gathered from the state; poses in either form."""
 
-    station_from_rangefinder: Float[Array, "6"]
-    world_from_station: Float[Array, "6"]
-    world_from_carrier: Float[Array, "6"]
-    carrier_from_target: Float[Array, "6"]
+    station_from_rangefinder: Float[Array, "6"] | Pose
+    world_from_station: Float[Array, "6"] | Pose
+    world_from_carrier: Float[Array, "6"] | Pose
+    carrier_from_target: Float[Array, "6"] | Pose
     point: Float[Array, "3"]
 
     @property
@@ -276,19 +279,19 @@ def predict_range(
     at = circumstances
     point = jnp.where(to_plane > 0.5, aim.point.at[2].set(0.0), aim.point)
     target = mark(point, at.target_centre, at.target_half_size, ports)
-    pose = aim.world_from_target
+    carrier, own = map(pose_from_vector, (aim.world_from_carrier, aim.carrier_from_target))
     delay = ports["clock.offset"]
     seen = look(
         pose_from_vector(aim.world_from_station),
         pose_from_vector(aim.station_from_rangefinder),
-        place(pose, target, delay, at.velocity, ports),
+        place(carrier, own, target, delay, at.velocity, ports),
         ports,
     )
     # A second mark, one metre along the plate's normal, gives the normal through the same chain.
     ahead = look(
         pose_from_vector(aim.world_from_station),
         pose_from_vector(aim.station_from_rangefinder),
-        place(pose, target + jnp.array([0.0, 0.0, 1.0]), delay, at.velocity, ports),
+        place(carrier, own, target + jnp.array([0.0, 0.0, 1.0]), delay, at.velocity, ports),
         ports,
     )
     normal = ahead - seen

@@ -1,9 +1,10 @@
 """Bundle adjustment problems in the text format of Bundle Adjustment in the Large, in and out.
 
-Agarwal, Snavely, Seitz & Szeliski 2010. A line with the numbers of cameras, points and observations;
-an observation a line (camera, point, u, v); then one number a line, nine for each camera (rotation
-vector, translation, focal length, k1, k2) and three for each point. There the camera looks along -z
-and v points up: both are turned about x here, which leaves every residual as long as it was.
+Agarwal, Snavely, Seitz & Szeliski 2010. A line with the numbers of cameras, points and
+observations; an observation a line (camera, point, u, v); then one number a line, nine for each
+camera (rotation vector, translation, focal length, k1, k2) and three for each point. There the
+camera looks along -z and v points up: both are turned about x here, which leaves every residual as
+long as it was.
 """
 
 import gzip
@@ -24,8 +25,8 @@ def import_bal(file: str | Path) -> Recording:
     """A recording of cameras, each on a station of its own, and one target with free points.
 
     Everything is free: poses, focal lengths (one for both axes), two radial coefficients, points.
-    Nothing is held, so seven unknowns (where it is, how it is turned, how large) are not determined:
-    adjust with damping and without the check of the gauge, as the other programs do.
+    Nothing is held, so seven unknowns (where it is, how it is turned, how large) are not
+    determined: adjust with damping and without the check of the gauge, as the other programs do.
 
     Args:
         file: text, gzipped if it ends in .gz.
@@ -40,8 +41,8 @@ def import_bal(file: str | Path) -> Recording:
         wrong = np.flatnonzero((index < 0) | (index >= count))
         if len(wrong):
             raise RecordingError(
-                f"{file.name} line {wrong[0] + 2}: {kind} {index[wrong[0]]} is not among the {count} "
-                "of the file; mend the line"
+                f"{file.name} line {wrong[0] + 2}: {kind} {index[wrong[0]]} is not among the "
+                f"{count} of the file; mend the line"
             )
     pixel = observations[:, 2:] * [1.0, -1.0]
     half = np.ceil(np.abs(pixel).max(axis=0)) + 1.0
@@ -56,8 +57,8 @@ def import_bal(file: str | Path) -> Recording:
         file.name.removesuffix(".gz").removesuffix(".txt"),
         cameras=tuple(
             Camera(
-                name[i], name[i], (width, height), "radial", np.full(2, row[6]), half.copy(), row[7:],
-                np.zeros(6), frozenset({"aspect-locked-focal", "distortion"}),
+                name[i], name[i], (width, height), "radial", np.full(2, row[6]), half.copy(),
+                row[7:], np.zeros(6), frozenset({"aspect-locked-focal", "distortion"}),
             )
             for i, row in enumerate(cameras)
         ),
@@ -117,7 +118,9 @@ def _numbers(file: Path):
             words = stream.read().split()
         values = np.array(words, float)
     except (OSError, EOFError, ValueError) as problem:
-        raise RecordingError(f"{file.name}: it is no bundle adjustment problem ({problem})") from None
+        raise RecordingError(
+            f"{file.name}: it is no bundle adjustment problem ({problem})"
+        ) from None
     counts = values[:3]
     if len(counts) < 3 or (counts < 1).any() or (counts % 1).any():
         raise RecordingError(

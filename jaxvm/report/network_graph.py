@@ -26,9 +26,8 @@ from jaxvm.network.relations import (
     link_relations,
     pose_graph,
 )
-from jaxvm.network.residual import linearise
+from jaxvm.network.residual import linearise, present
 from jaxvm.network.scene import Scene
-from jaxvm.physics.effects import course_slopes, courses
 from jaxvm.solve.adjust import Adjustment
 from jaxvm.solve.covariance import pose_covariances
 from jaxvm.solve.snooping import redundancy
@@ -282,11 +281,9 @@ def _sights(adjustment: Adjustment, blocks):
     """Relative poses of all views: relations, (camera, target, epoch), trace of the hat matrix,
     squared residuals over redundancy; and the number of views that give none."""
     scene, problem = adjustment.scene, adjustment.problem
-    network, layout = problem.network, problem.network.layout
+    network = problem.network
     obs, flat = scene.recording.observations, problem.flat(adjustment.x)
-    constant = flat[layout.offset("constant") : layout.offset("identity")]
-    values = courses(network.effects, constant, network.channels)
-    slopes = course_slopes(network.effects, constant, network.channels)
+    at = present(network, flat)
     view = np.stack([obs.camera, obs.target, obs.epoch], axis=1)
     views, of_row = np.unique(view, axis=0, return_inverse=True)
     of_row = np.ravel(of_row)
@@ -295,7 +292,7 @@ def _sights(adjustment: Adjustment, blocks):
     hat, square, count = np.zeros(n), np.zeros(n), np.zeros(n, int)
     for rows, factor, block in zip(scene.tables, network.pixels, blocks, strict=False):
         first = sum(factor.widths[:6])
-        table = linearise(factor, network, flat, values, slopes, tuple(range(first, first + 6)))
+        table = linearise(factor, network, at, tuple(range(first, first + 6)))
         weight = np.asarray(factor.weight)[: len(rows)]
         used = weight > 0.0
         scale = np.where(

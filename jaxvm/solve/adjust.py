@@ -14,12 +14,11 @@ from jaxvm.network.scene import Scene
 from jaxvm.solve.compiling import compile_seconds
 from jaxvm.solve.descent import Descent
 from jaxvm.solve.gauge import check_gauge
-from jaxvm.solve.large import check_large_gauge, is_large, minimise_large, scaled_large
+from jaxvm.solve.large import check_large_gauge, minimise_large, prepared
 from jaxvm.solve.lbfgs import minimise_lbfgs
 from jaxvm.solve.optimise import METHODS, minimise
 from jaxvm.solve.problem import Problem, normal_at, scaled, scene_problem
 from jaxvm.solve.robust import Loss, SquaredLoss
-from jaxvm.solve.sparse import Pattern, SparseFactors
 from jaxvm.solve.spgd import minimise_spgd
 
 
@@ -239,8 +238,8 @@ def _adjusted(
         problem = eqx.tree_at(lambda p: p.network.links.weight, problem, jnp.asarray(link_weights))
     if active is not None:
         problem = eqx.tree_at(lambda p: p.active, problem, problem.active & jnp.asarray(active))
-    if is_large(problem):
-        return _adjusted_large(scene, problem, method, rtol, damping, max_steps, check)
+    if (host := prepared(problem)) is not None:
+        return _adjusted_large(scene, *host, method, rtol, damping, max_steps, check)
     problem, normal = scaled(problem, normal_at(problem, jnp.zeros(problem.n)))
     if check:
         check_gauge(normal, scene.unknowns)
@@ -302,12 +301,9 @@ def _descended(scene: Scene, problem: Problem, diagonal, method: str, max_steps)
 
 
 def _adjusted_large(
-    scene: Scene, problem: Problem, method, rtol, damping, max_steps, check
+    scene: Scene, problem: Problem, normal, factors, method, rtol, damping, max_steps, check
 ) -> Adjustment:
-    """The adjustment of a large network, by sparse factors on the host."""
-    pattern = Pattern.of(problem)
-    factors = SparseFactors(pattern)
-    problem, normal = scaled_large(problem, pattern)
+    """The adjustment of a large network, by a loop on the host."""
     if check:
         check_large_gauge(problem, normal, factors, scene.unknowns)
     if method in DESCENTS:

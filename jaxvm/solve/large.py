@@ -5,6 +5,7 @@ that opens fast, and a statistical stop.
 """
 
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import equinox as eqx
 import jax
@@ -15,6 +16,7 @@ from jaxtyping import Float
 from jaxvm.network.unknowns import Unknowns
 from jaxvm.solve.gauge import RankDeficiency, deficiency, named_direction
 from jaxvm.solve.problem import Problem, to_unit_diagonal
+from jaxvm.solve.schur import SchurFactors, SchurPattern, schur_normal
 from jaxvm.solve.sparse import Pattern, SparseFactors, SparseNormal, sparse_normal, total_cost
 
 _MOST_DAMPING, _LEAST_DAMPING = 1e12, 1e-12
@@ -30,10 +32,55 @@ _DENSE = 1500
 """Shared unknowns beyond which a dense arrow is slower than sparse factors, and soon too large."""
 
 
+_WIDE = 1_000_000
+"""Couplings of groups with shared unknowns beyond which those that are zero are left out."""
+
+
 def is_large(problem: Problem) -> bool:
-    """Whether a problem is solved by sparse factors on the host."""
+    """Whether covariances of a problem come from sparse factors on the host."""
     s, groups, d = problem.sizes
     return s > _DENSE or s * groups * d > 50_000_000
+
+
+class Equations(Protocol):
+    """Normal equations of a problem at one x."""
+
+    @property
+    def pattern(self) -> Any: ...
+    @property
+    def cost(self) -> float: ...
+    @property
+    def gradient(self) -> Any: ...
+    def diagonal(self) -> Float[np.ndarray, " n"]: ...
+    def at(self, problem: Problem, x: Any) -> Any: ...
+
+
+class Factors(Protocol):
+    """Place for the factors of damped normal equations."""
+
+    def factorise(self, normal: Any, damping: float = 0.0) -> bool: ...
+    def damped(self, normal: Any) -> Float[np.ndarray, " n"]: ...
+    def solve(self, right: Any) -> Any: ...
+
+
+def prepared(problem: Problem) -> tuple[Problem, Equations, Factors] | None:
+    """A problem with unknowns scaled to a unit diagonal, its normal equations at x = 0, and a place
+    for their factors; None where the dense arrow is quicker.
+
+    Many groups that each touch few of some hundred shared unknowns are eliminated one by one
+    (`jaxvm.solve.schur`); beyond that everything is one sparse matrix (`jaxvm.solve.sparse`).
+    """
+    s, groups, d = problem.sizes
+    if s <= _DENSE and s * groups * d > _WIDE:
+        pattern = SchurPattern.of(problem)
+        if pattern is not None and not pattern.is_full:
+            return *_unit(
+                problem, schur_normal(problem, pattern, jnp.zeros(problem.n))
+            ), SchurFactors(pattern)
+    if not is_large(problem):
+        return None
+    pattern = Pattern.of(problem)
+    return *scaled_large(problem, pattern), SparseFactors(pattern)
 
 
 @dataclass(frozen=True)
@@ -49,15 +96,18 @@ class LargeFit:
 
 def scaled_large(problem: Problem, pattern: Pattern) -> tuple[Problem, SparseNormal]:
     """The problem with unknowns scaled to a unit diagonal, and its normal equations at x = 0."""
-    normal = sparse_normal(problem, pattern, jnp.zeros(problem.n))
+    return _unit(problem, sparse_normal(problem, pattern, jnp.zeros(problem.n)))
+
+
+def _unit(problem: Problem, normal):
     problem, scale = to_unit_diagonal(problem, normal.diagonal())
     return problem, normal.rescaled(scale)
 
 
 def minimise_large(
     problem: Problem,
-    normal: SparseNormal,
-    factors: SparseFactors,
+    normal: Equations,
+    factors: Factors,
     method: str,
     rtol: float = 1e-12,
     atol: float = 1e-9,
@@ -79,7 +129,7 @@ def minimise_large(
         damping: the first one of Levenberg-Marquardt.
     """
     x, history, accepted = np.zeros(problem.n), [normal.cost], 0
-    refused = 0
+    refused, bold = 0, True
     careful = method == "levenberg-marquardt"
     damping = damping if careful else 0.0
     why = f"stopped after {limit} evaluations: not converged"
@@ -90,9 +140,10 @@ def minimise_large(
                 break
             damping = max(10.0 * damping, _LEAST_DAMPING)
             continue
-        step = -factors.solve(normal.gradient)
-        # step^T H step = -(gradient + damping step)^T step
-        foretold = -0.5 * float(normal.gradient @ step) + 0.5 * damping * float(step @ step)
+        step = -np.asarray(factors.solve(normal.gradient))
+        # step^T H step = -(gradient + damping D step)^T step, D what damping is relative to
+        damped = damping * float(step @ (factors.damped(normal) * step))
+        foretold = -0.5 * float(np.asarray(normal.gradient) @ step) + 0.5 * damped
         if abs(foretold) <= rtol * normal.cost + atol and damping <= 1.0:
             # The last step: its cost is wanted, no equations for a further one.
             cost = total_cost(problem, jnp.asarray(x + step))
@@ -102,12 +153,16 @@ def minimise_large(
             history.append(cost if lower else normal.cost)
             why = "converged: the cost no longer changes"
             break
-        trial = sparse_normal(problem, normal.pattern, jnp.asarray(x + step))
-        gained = normal.cost - trial.cost
-        better = np.isfinite(trial.cost) and (not careful or gained > 1e-4 * foretold)
+        at = jnp.asarray(x + step)
+        # After a refusal another one is likely: the cost tells it for less than the equations.
+        trial = None if refused else normal.at(problem, at)
+        cost = total_cost(problem, at) if trial is None else trial.cost
+        gained = normal.cost - cost
+        better = np.isfinite(cost) and (not careful or gained > 1e-4 * foretold)
         settled = abs(gained) <= rtol * normal.cost + atol
         if better:
-            x, normal, accepted = x + step, trial, accepted + 1
+            normal = normal.at(problem, at) if trial is None else trial
+            x, accepted = x + step, accepted + 1
         history.append(normal.cost)
         if settled and damping <= 1.0:
             why = "converged: the cost no longer changes"
@@ -121,22 +176,29 @@ def minimise_large(
         if careful:
             ratio = gained / foretold if foretold > 0.0 else -1.0
             refused = 0 if better else refused + 1
-            damping = _changed(damping, ratio, refused)
+            bold = bold and better
+            damping = _changed(damping, ratio, refused, bold)
     return LargeFit(x, np.array(history), len(history), accepted, why)
 
 
-def _changed(damping: float, ratio: float, refused: int) -> float:
-    """Much less after a step that went as foretold; ever more after bad ones in a row.
+def _changed(damping: float, ratio: float, refused: int, bold: bool) -> float:
+    """Less after a step that went as foretold; ever more after bad ones in a row.
 
-    The weak modes of a large network need a damping near nothing, and every step counts.
+    The weak modes of a large network need a damping near nothing, and every step counts: it falls
+    steeply until a step is refused. From then on the problem is known to bend, and it falls as in
+    Nielsen 1999, which is seldom refused again.
     """
     if refused:
         return 10.0**refused * damping
-    return max(damping * (1e-3 if ratio > 0.75 else 0.1 if ratio > 0.25 else 1.0), _LEAST_DAMPING)
+    if bold:
+        factor = 1e-3 if ratio > 0.75 else 0.1 if ratio > 0.25 else 1.0
+    else:
+        factor = max(1.0 / 3.0, 1.0 - (2.0 * min(ratio, 1.0) - 1.0) ** 3)
+    return max(damping * factor, _LEAST_DAMPING)
 
 
 def check_large_gauge(
-    problem: Problem, normal: SparseNormal, factors: SparseFactors, unknowns: Unknowns
+    problem: Problem, normal: Equations, factors: Factors, unknowns: Unknowns
 ) -> None:
     """Raise RankDeficiency, naming the unknowns, where a scaled problem is singular.
 

@@ -12,11 +12,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxvm.network.factors import Factor, rounded
-from jaxvm.network.residual import Linearised, Network, Residuals, linearise, residual
+from jaxvm.network.residual import Linearised, Network, Residuals, linearise, present, residual
 from jaxvm.network.scene import Scene
 from jaxvm.network.state import Layout, State
 from jaxvm.network.unknowns import Unknowns
-from jaxvm.physics.effects import course_slopes, courses
 from jaxvm.solve.arrow import Arrow
 from jaxvm.solve.robust import Loss, SquaredLoss
 
@@ -143,12 +142,10 @@ class Problem(eqx.Module):
         raw, whiten, steps = [], [], []
         flat, per_parameter = flat_state(self, x)
         network, layout = self.network, self.network.layout
-        constant = flat[layout.offset("constant") : layout.offset("identity")]
-        values = courses(network.effects, constant, network.channels)
-        slopes = course_slopes(network.effects, constant, network.channels)
+        at = present(network, flat)
         effects = np.concatenate([layout.all("amplitude"), layout.all("constant")])
         for factor, packets in zip(network.factors(), self.packets, strict=True):
-            raw.append(linearise(factor, network, flat, values, slopes, packets.live, tangent))
+            raw.append(linearise(factor, network, at, packets.live, tangent))
             whiten.append((factor.weight, factor.sigma))
             steps.append((factor.slots, jnp.asarray(effects), packets.live))
         return whitened(raw, whiten, steps, per_parameter)

@@ -19,8 +19,7 @@ import numpy as np
 from cvxopt import cholmod  # pyright: ignore[reportAttributeAccessIssue]
 from jaxtyping import Array, Float, Int
 
-from jaxvm.network.residual import linearise
-from jaxvm.physics.effects import course_slopes, courses
+from jaxvm.network.residual import linearise, present
 from jaxvm.solve.problem import Packets, Problem, flat_state, whitened
 
 _ROWS_AT_A_TIME = 256
@@ -117,6 +116,10 @@ class SparseNormal:
         """Diagonal of the matrix."""
         return self.values[self.pattern.diagonal]
 
+    def at(self, problem: Problem, x: Float[Array, " n"]) -> "SparseNormal":
+        """The normal equations elsewhere."""
+        return sparse_normal(problem, self.pattern, x)
+
     def rescaled(self, scale: Float[np.ndarray, " n"]) -> "SparseNormal":
         """The same for unknowns in other units: x_new = x / scale."""
         both = scale[self.pattern.row] * scale[self.pattern.column]
@@ -164,9 +167,7 @@ def _products(problem: Problem, packets_of: tuple[Packets, ...], x):
     """Cost, and J^T J and J^T r of some packets of every table."""
     network, layout = problem.network, problem.network.layout
     flat, per_parameter = flat_state(problem, x)
-    constant = flat[layout.offset("constant") : layout.offset("identity")]
-    values = courses(network.effects, constant, network.channels)
-    slopes = course_slopes(network.effects, constant, network.channels)
+    now = present(network, flat)
     effects = jnp.asarray(np.concatenate([layout.all("amplitude"), layout.all("constant")]))
 
     def of_packet(rows, factor, packets: Packets):
@@ -174,7 +175,7 @@ def _products(problem: Problem, packets_of: tuple[Packets, ...], x):
         at = jnp.minimum(rows, n - 1)
         own = jax.tree.map(lambda leaf: leaf[at] if leaf.ndim else leaf, factor)
         weight = jnp.where(rows < n, own.weight, 0.0)
-        raw = linearise(own, network, flat, values, slopes, packets.live)
+        raw = linearise(own, network, now, packets.live)
         (table,) = whitened(
             [raw], [(weight, own.sigma)], [(own.slots, effects, packets.live)], per_parameter
         )
@@ -227,6 +228,10 @@ class SparseFactors:
         except ArithmeticError:
             return False
         return True
+
+    def damped(self, normal: SparseNormal) -> Float[np.ndarray, " n"]:
+        """What damping is relative to: the unit diagonal of a scaled problem."""
+        return np.ones(self.pattern.n)
 
     def solve(self, right: Float[np.ndarray, "n *k"]) -> Float[np.ndarray, "n *k"]:
         """Solution for one right-hand side or a block of them, with the latest factors."""
