@@ -67,7 +67,7 @@ def test_bad_recording(command, board, tmp_path, capsys):
         (["diagnose", "nowhere"], "there is no such folder"),
         (["demo", "--hide", "gremlins"], 'no effect "gremlins" can be hidden'),
         (["simulate", "deformation", "--hide", "x", "--out", "o"], 'no effect "x"'),
-        (["convert", "nothing.txt", "--out", "o"], "is no folder"),
+        (["convert", "nothing.docx", "--out", "o"], "is no folder"),
     ],
 )
 def test_bad_arguments(arguments, words, tmp_path, capsys, monkeypatch):

@@ -5,6 +5,7 @@ from typing import Literal
 
 import tomli_w
 
+from jaxvm.recording.bal import import_bal
 from jaxvm.recording.datasets import DATASETS, open_recording
 from jaxvm.recording.errors import RecordingError
 from jaxvm.recording.files import new_folder
@@ -39,7 +40,8 @@ def convert(
     recording that one. OpenCV's calibration (.yml, .yaml, .xml) has no observations: `out` gets a
     recording.toml with its cameras, to which targets and tables are to be added. A pose graph
     (.g2o, .g2o.gz) becomes stations and links, with `mend` where its information is not positive
-    definite; where `out` is such a file, stations and links become a pose graph.
+    definite; where `out` is such a file, stations and links become a pose graph. A problem of
+    bundle adjustment (.txt, .txt.gz) becomes cameras and one target whose points are free.
 
     Raises:
         RecordingError: the source is wrong, or needs a number that was not given.
@@ -77,12 +79,14 @@ def convert(
         )
     elif path.name.endswith((".g2o", ".g2o.gz")):
         recording = import_g2o(path, mend)
+    elif path.name.endswith((".txt", ".txt.gz")):
+        recording = import_bal(path)
     elif kind == ".cameramodel":
         recording = import_cameramodel(path)
     else:
         raise RecordingError(
             f"{source}: it is no folder, no public recording ({', '.join(DATASETS)}), and no .csv, "
-            ".vnl, .cameramodel, .g2o, .yml or .xml file; mend the name"
+            ".vnl, .cameramodel, .g2o, .txt (bundle adjustment), .yml or .xml file; mend the name"
         )
     if Path(out).name.endswith((".g2o", ".g2o.gz")):
         if Path(out).exists():

@@ -38,9 +38,9 @@ class Buckets(eqx.Module):
         """Lists 0 to n - 1 of the members that they own, in their order; longest over shortest
         list of a bucket is at most `growth`."""
         count = np.bincount(owner, minlength=n)
-        member = np.argsort(owner, kind="stable")
+        member = _order(owner, n)
         first = np.cumsum(count) - count
-        order = np.argsort(count, kind="stable")
+        order = _order(count, int(count.max(initial=0)) + 1)
         rows, at = [], 0
         while at < n:
             least = count[order[at]]
@@ -60,6 +60,11 @@ class Buckets(eqx.Module):
         """Sum of the values of each list."""
         padded = _padded(values)
         return jnp.concatenate([padded[rows].sum(axis=1) for rows in self.rows])[self.place]
+
+
+def _order(numbers: Int[np.ndarray, " n"], bound: int) -> Int[np.ndarray, " n"]:
+    """Places in ascending order of numbers below a bound; NumPy counts where they are short."""
+    return np.argsort(numbers.astype(np.uint16) if bound <= 1 << 16 else numbers, kind="stable")
 
 
 def _padded(values: Array) -> Array:
@@ -231,8 +236,10 @@ class SchurPattern(eqx.Module):
             own = np.where(at[:, shared_at] < s, at[:, shared_at], s)
             tied = _tied(own)
             own = own[:, [together[0] for together in tied]]
-            distinct, of_packet = np.unique(own, axis=0, return_inverse=True)
-            of_packet = of_packet.ravel()
+            # Rows with the same unknowns have the same sum of hashes.
+            hashes = np.random.default_rng(0).integers(1 << 62, size=own.shape[1], dtype=np.int64)
+            _, where, of_packet = np.unique(own @ hashes, return_index=True, return_inverse=True)
+            distinct = own[where]
             live = np.array(packets.live)
             k = int(np.sum(live[shared_at] < factor.slots.shape[1]))
             order = np.concatenate([shared_at[:k], local_at, shared_at[k:]])
@@ -271,8 +278,9 @@ class SchurPattern(eqx.Module):
         swap = view[p] > view[q]
         p, q = np.where(swap, q, p), np.where(swap, p, q)
         key = view[p] * n_views + view[q]
-        distinct, of_pair = np.unique(key, return_inverse=True)
-        pairs = Products.of(of_pair.ravel(), len(distinct), p, q, len(group))
+        met = np.bincount(key, minlength=1) > 0
+        distinct, of_pair = np.flatnonzero(met), (np.cumsum(met) - 1)[key]
+        pairs = Products.of(of_pair, len(distinct), p, q, len(group))
         # What fills up falls on a view without unknowns.
         columns = np.append(columns, np.full((1, wide), s), axis=0)
         a, b = np.where(pairs.list < 0, n_views, np.array(divmod(distinct, n_views))[:, pairs.list])
@@ -320,7 +328,7 @@ def _split(at, local, s: int, d: int):
 def _pairs_in_groups(group, n_groups: int):
     """All pairs of packets of one group: each with itself, and each two once."""
     used = np.flatnonzero(group < n_groups)
-    member = used[np.argsort(group[used], kind="stable")]
+    member = used[_order(group[used], n_groups)]
     count = np.bincount(group[used], minlength=n_groups)
     first = np.cumsum(count) - count
     left, right = [np.zeros(0, int)], [np.zeros(0, int)]
@@ -454,6 +462,8 @@ class SchurFactors:
 
     Unknowns that no observation touches (zero diagonal) stay where they are.
     """
+
+    bends = True
 
     def __init__(self, pattern: SchurPattern):
         self.pattern = pattern

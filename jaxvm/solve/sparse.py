@@ -205,6 +205,8 @@ class SparseFactors:
     Unknowns that no observation touches (zero diagonal) stay where they are.
     """
 
+    bends = False
+
     def __init__(self, pattern: Pattern):
         self.pattern = pattern
         self._matrix = cvxopt.spmatrix(
