@@ -14,7 +14,8 @@ from jaxvm.solve import large
 from jaxvm.solve.adjust import adjust
 from jaxvm.solve.problem import normal_at, scaled, scene_problem
 from jaxvm.solve.robust import HuberLoss, SquaredLoss
-from jaxvm.solve.schur import SchurFactors, SchurPattern, schur_normal
+from jaxvm.solve.schur import SchurFactors, schur_normal
+from jaxvm.solve.schur_pattern import SchurPattern
 
 
 def block(n_cameras=7, n_points=60, seed=0, noise=0.5):
@@ -78,7 +79,7 @@ def test_steps_are_those_of_the_dense_arrow(scene, which, loss):
         scene = free_points_recording().true_scene()
     problem = scene_problem(scene, loss)
     problem, dense = scaled(problem, normal_at(problem, jnp.zeros(problem.n)))
-    pattern = SchurPattern.of(problem)
+    pattern = SchurPattern.of(problem, share=np.inf)
     assert pattern is not None
     normal = schur_normal(problem, pattern, jnp.zeros(problem.n))
     assert normal.cost == pytest.approx(float(dense.cost), rel=1e-12)
@@ -105,7 +106,9 @@ def test_adjustments_end_at_the_same_cost(scene, monkeypatch):
     options = dict(check=False, damping=1e-4, rtol=1e-12)
     dense = adjust(scene, **options)
     monkeypatch.setattr(large, "_WIDE", 0)
-    monkeypatch.setattr(SchurPattern, "is_full", False)
+    monkeypatch.setattr(SchurPattern.of.__func__, "__defaults__", (np.inf,))
+    problem = scene_problem(scene)
+    assert isinstance(large.prepared(problem)[2], SchurFactors)
     found = adjust(scene, **options)
     assert found.converged and dense.converged
     assert found.cost == pytest.approx(dense.cost, rel=1e-9)
@@ -114,7 +117,7 @@ def test_adjustments_end_at_the_same_cost(scene, monkeypatch):
 
 def test_an_indefinite_matrix_is_no_step(scene):
     problem = scene_problem(scene)
-    pattern = SchurPattern.of(problem)
+    pattern = SchurPattern.of(problem, share=np.inf)
     normal = schur_normal(problem, pattern, jnp.zeros(problem.n))
     spoilt = replace(normal, shared=-normal.shared)
     assert not SchurFactors(pattern).factorise(spoilt, 1e-3)
@@ -145,3 +148,9 @@ def test_a_real_block_ends_where_a_peer_does():
     found = adjust(build(import_bal(file)), check=False, damping=1e-4, rtol=1e-7)
     assert found.cost_before == pytest.approx(4413239.314, rel=1e-9)
     assert found.converged and found.cost < 30378.66
+
+
+def test_where_little_is_left_out_the_arrow_is_taken():
+    """All points in all images: every pair of views meets in every point."""
+    problem = scene_problem(free_points_recording().true_scene())
+    assert SchurPattern.of(problem) is None

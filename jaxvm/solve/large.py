@@ -17,7 +17,8 @@ from jaxtyping import Float
 from jaxvm.network.unknowns import Unknowns
 from jaxvm.solve.gauge import RankDeficiency, deficiency, named_direction
 from jaxvm.solve.problem import Problem, to_unit_diagonal
-from jaxvm.solve.schur import SchurFactors, SchurPattern, schur_normal
+from jaxvm.solve.schur import SchurFactors, schur_normal
+from jaxvm.solve.schur_pattern import SchurPattern
 from jaxvm.solve.sparse import Pattern, SparseFactors, SparseNormal, sparse_normal, total_cost
 
 _MOST_DAMPING, _LEAST_DAMPING = 1e12, 1e-12
@@ -79,7 +80,7 @@ def prepared(problem: Problem) -> tuple[Problem, Equations, Factors] | None:
     s, groups, d = problem.sizes
     if s <= _DENSE and s * groups * d > _WIDE:
         pattern = SchurPattern.of(problem)
-        if pattern is not None and not pattern.is_full:
+        if pattern is not None:
             return *_unit(
                 problem, schur_normal(problem, pattern, jnp.zeros(problem.n))
             ), SchurFactors(pattern)

@@ -5,8 +5,6 @@ In a block of images every point is a group of unknowns that a few views see. Th
 counts. Two packets of observations of one group fall on a pair of views, and all that fall on one
 pair are gathered into one product of matrices (Brown 1958; Triggs et al. 2000, section 6; Agarwal
 et al. 2010).
-
-Members are gathered and multiplied a few hundred at a time: what is gathered stays in the cache.
 """
 
 from dataclasses import dataclass, replace
@@ -16,328 +14,12 @@ import jax
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from jaxvm.network.residual import linearise, present
-from jaxvm.solve.problem import Packets, Problem, assemble, flat_state, in_packets, whitened
-
-
-class Buckets(eqx.Module):
-    """Lists of unequal length as a few full tables: lists of like length are filled up alike.
-
-    Attributes:
-        rows: for each bucket the members of its lists; what is filled up points past the end.
-        place: where list k stands in the buckets, one after the other.
-    """
-
-    rows: tuple[Int[Array, "lists width"], ...]
-    place: Int[Array, " lists"]
-
-    @classmethod
-    def of(cls, owner: Int[np.ndarray, " members"], n: int, growth: float) -> "Buckets":
-        """Lists 0 to n - 1 of the members that they own, in their order; longest over shortest
-        list of a bucket is at most `growth`."""
-        count = np.bincount(owner, minlength=n)
-        member = _order(owner, n)
-        first = np.cumsum(count) - count
-        order = _order(count, int(count.max(initial=0)) + 1)
-        rows, at = [], 0
-        while at < n:
-            least = count[order[at]]
-            most = max(int(growth * least), least, 1)
-            end = int(np.searchsorted(count[order], most, "right"))
-            own = order[at:end]
-            width = np.arange(max(int(count[own[-1]]), 1))
-            inside = width < count[own, None]
-            index = np.minimum(first[own, None] + width, max(len(member) - 1, 0))
-            rows.append(jnp.asarray(np.where(inside, member[index], len(owner))))
-            at = end
-        place = np.empty(n, int)
-        place[order] = np.arange(n)
-        return cls(tuple(rows), jnp.asarray(place))
-
-    def sums(self, values: Float[Array, "members ..."]) -> Float[Array, "lists ..."]:
-        """Sum of the values of each list."""
-        padded = _padded(values)
-        return jnp.concatenate([padded[rows].sum(axis=1) for rows in self.rows])[self.place]
-
-
-def _order(numbers: Int[np.ndarray, " n"], bound: int) -> Int[np.ndarray, " n"]:
-    """Places in ascending order of numbers below a bound; NumPy counts where they are short."""
-    return np.argsort(numbers.astype(np.uint16) if bound <= 1 << 16 else numbers, kind="stable")
-
-
-def _padded(values: Array) -> Array:
-    return jnp.concatenate([values, jnp.zeros((1, *values.shape[1:]), values.dtype)])
-
-
-_MEMBERS = 256
-"""Members of lists that are gathered at a time."""
-
-
-class Products(eqx.Module):
-    """Sums of products of matrices over lists of unequal length, list by list.
-
-    Attributes:
-        left, right: members of each list, a few lists together: [pieces, lists, width] for each
-            bucket. What fills up points past the end.
-        list: which list each product belongs to, one after the other; -1 for what fills up.
-    """
-
-    left: tuple[Int[Array, "pieces lists width"], ...]
-    right: tuple[Int[Array, "pieces lists width"], ...]
-    list: Int[np.ndarray, " products"]
-
-    @classmethod
-    def of(cls, owner: Int[np.ndarray, " members"], n: int, left, right, end: int) -> "Products":
-        """Lists 0 to n - 1; member k of its list multiplies row left[k] with row right[k].
-
-        Args:
-            end: number of rows; a row of zeros stands behind them.
-        """
-        buckets = Buckets.of(owner, n, 1.25)
-        left, right = np.append(left, end), np.append(right, end)
-        order = np.argsort(np.asarray(buckets.place))
-        found, first = ([], [], []), 0
-        for rows in map(np.asarray, buckets.rows):
-            count, width = rows.shape
-            together = max(_MEMBERS // width, 1)
-            pieces = -(-count // together)
-            spare = pieces * together - count
-            rows = np.pad(rows, ((0, spare), (0, 0)), constant_values=len(owner))
-            rows = rows.reshape(pieces, together, width)
-            found[0].append(jnp.asarray(left[rows]))
-            found[1].append(jnp.asarray(right[rows]))
-            found[2].append(np.pad(order[first : first + count], (0, spare), constant_values=-1))
-            first += count
-        return cls(tuple(found[0]), tuple(found[1]), np.concatenate(found[2]))
-
-    def __call__(self, values: Float[Array, "rows d k"]) -> Float[Array, "products k k"]:
-        """Sum of values[left]^T values[right] over the members of each list."""
-        padded = _padded(values)
-        k = values.shape[2]
-
-        def piece(rows):
-            a, b = (jnp.reshape(padded[own], (own.shape[0], -1, k)) for own in rows)
-            return jnp.einsum("lra,lrb->lab", a, b)
-
-        parts = [
-            jnp.reshape(jax.lax.map(piece, both), (-1, k, k))
-            for both in zip(self.left, self.right, strict=True)
-        ]
-        return jnp.concatenate(parts)
-
-
-class View(eqx.Module):
-    """A table of observations, its packets sorted into views.
-
-    Attributes:
-        packets: rows of each packet; `live` are its own shared positions, the local ones, effects.
-        views: packets of each view, that is of each combination of shared unknowns.
-        squares: of the packets of each view, in `square_columns`.
-        columns: shared unknowns of each view; their number where there is none.
-        local: which of the live positions are local: from and to.
-        tied: shared positions that are one unknown in all views, together.
-    """
-
-    packets: Packets
-    views: Buckets
-    squares: Products
-    square_columns: Int[Array, "products shared"]
-    columns: Int[Array, "views shared"]
-    local: tuple[int, int] = eqx.field(static=True)
-    tied: tuple[tuple[int, ...], ...] = eqx.field(static=True)
-
-    def split(self, values: Float[Array, "... live"]) -> tuple[Array, Array]:
-        """Shared and local columns."""
-        a, b = self.local
-        shared = jnp.concatenate([values[..., :a], values[..., b:]], axis=-1)
-        if len(self.tied) < shared.shape[-1]:
-            shared = jnp.stack([sum(shared[..., k] for k in own) for own in self.tied], axis=-1)
-        return shared, values[..., a:b]
-
-
-class SchurPattern(eqx.Module):
-    """Which packets meet in which groups and views.
-
-    Packets of all tables with local unknowns are numbered one after the other, and so are views.
-
-    Attributes:
-        tables: views of those with local unknowns, packets of the others.
-        groups: packets of each group.
-        group: of each packet; the number of groups where it fills up.
-        pairs: packets of one group by the pair of views that they fall on.
-        pair_rows, pair_columns: shared unknowns of both views of each pair.
-        halved: factor on each pair: 1/2 for a view with itself, because pairs count both ways.
-        sizes: shared unknowns, groups, unknowns of a group.
-    """
-
-    tables: tuple[View | Packets, ...]
-    groups: Buckets
-    group: Int[Array, " packets"]
-    pairs: Products
-    pair_rows: Int[Array, "pairs shared"]
-    pair_columns: Int[Array, "pairs shared"]
-    halved: Float[Array, " pairs"]
-    sizes: tuple[int, int, int] = eqx.field(static=True)
-
-    @property
-    def views(self) -> list[View]:
-        """Tables with local unknowns."""
-        return [table for table in self.tables if isinstance(table, View)]
-
-    @property
-    def is_full(self) -> bool:
-        """Whether views meet as often as there are shared unknowns: nothing is left out then."""
-        return self.pairs.list.size * self.pair_rows.shape[1] ** 2 > 4 * self.sizes[0] ** 2
-
-    @property
-    def n(self) -> int:
-        """Number of unknowns."""
-        s, groups, d = self.sizes
-        return s + groups * d
-
-    def by_table(self, values: Array) -> list[tuple[View, Array]]:
-        """Tables with local unknowns, each with the values of its own packets."""
-        found, first = [], 0
-        for view in self.views:
-            n = len(view.packets.rows)
-            found.append((view, values[first : first + n]))
-            first += n
-        return found
-
-    @classmethod
-    def of(cls, problem: Problem) -> "SchurPattern | None":
-        """Pattern of a problem; None where a table mixes shared and local unknowns at one place."""
-        s, n_groups, d = problem.sizes
-        tables, group, view, columns = [], [], [], []
-        n_views = 0
-        for factor, packets in zip(problem.network.factors(), problem.packets, strict=True):
-            at = np.asarray(packets.columns)
-            local = (at >= s) & (at < s + n_groups * d)
-            if not local.any():
-                tables.append(packets)
-                continue
-            split = _split(at, local, s, d)
-            if split is None:
-                return None
-            shared_at, local_at = split
-            used = local.any(axis=1)
-            rows = np.asarray(packets.rows)
-            if rows.shape[1] == 1:
-                # One row a packet: in the order of the table nothing has to be gathered.
-                n = factor.slots.shape[0]
-                order = np.full(n, len(rows))
-                real = rows[:, 0] < n
-                order[rows[real, 0]] = np.flatnonzero(real)
-                at = np.concatenate([at, np.full((1, at.shape[1]), s + n_groups * d)])[order]
-                used = np.append(used, False)[order]
-                rows = np.arange(n)[:, None]
-            own = np.where(at[:, shared_at] < s, at[:, shared_at], s)
-            tied = _tied(own)
-            own = own[:, [together[0] for together in tied]]
-            # Rows with the same unknowns have the same sum of hashes.
-            hashes = np.random.default_rng(0).integers(1 << 62, size=own.shape[1], dtype=np.int64)
-            _, where, of_packet = np.unique(own @ hashes, return_index=True, return_inverse=True)
-            distinct = own[where]
-            live = np.array(packets.live)
-            k = int(np.sum(live[shared_at] < factor.slots.shape[1]))
-            order = np.concatenate([shared_at[:k], local_at, shared_at[k:]])
-            chosen = Packets(jnp.asarray(rows), jnp.asarray(own), tuple(live[order].tolist()))
-            buckets = Buckets.of(of_packet, len(distinct), 1.5)
-            each = np.arange(len(of_packet))
-            squares = Products.of(of_packet, len(distinct), each, each, len(each))
-            held = np.append(distinct, np.full((1, distinct.shape[1]), s), axis=0)
-            tables.append(
-                View(
-                    chosen,
-                    buckets,
-                    squares,
-                    jnp.asarray(held[squares.list]),
-                    jnp.asarray(distinct),
-                    (k, k + d),
-                    tied,
-                )
-            )
-            first = np.where(used, at[:, local_at].min(axis=1, initial=s + n_groups * d), s)
-            group.append(np.where(used, (first - s) // max(d, 1), n_groups))
-            view.append(n_views + of_packet)
-            columns.append(distinct)
-            n_views += len(distinct)
-        if not group:
-            return None
-        wide = max(own.shape[1] for own in columns)
-        columns = np.concatenate(
-            [np.pad(own, ((0, 0), (0, wide - own.shape[1])), constant_values=s) for own in columns]
-        )
-        group, view = np.concatenate(group), np.concatenate(view)
-        p, q = _pairs_in_groups(group, n_groups)
-        # Two packets of one view count in both orders, as two of different views do by symmetry.
-        again = np.flatnonzero((view[p] == view[q]) & (p != q))
-        p, q = np.append(p, q[again]), np.append(q, p[again])
-        swap = view[p] > view[q]
-        p, q = np.where(swap, q, p), np.where(swap, p, q)
-        key = view[p] * n_views + view[q]
-        met = np.bincount(key, minlength=1) > 0
-        distinct, of_pair = np.flatnonzero(met), (np.cumsum(met) - 1)[key]
-        pairs = Products.of(of_pair, len(distinct), p, q, len(group))
-        # What fills up falls on a view without unknowns.
-        columns = np.append(columns, np.full((1, wide), s), axis=0)
-        a, b = np.where(pairs.list < 0, n_views, np.array(divmod(distinct, n_views))[:, pairs.list])
-        return cls(
-            tables=tuple(tables),
-            groups=Buckets.of(group[group < n_groups], n_groups, 1.3)
-            if (group < n_groups).all()
-            else _of_used(group, n_groups),
-            group=jnp.asarray(group),
-            pairs=pairs,
-            pair_rows=jnp.asarray(columns[a]),
-            pair_columns=jnp.asarray(columns[b]),
-            halved=jnp.asarray(np.where(a == b, 0.5, 1.0)),
-            sizes=problem.sizes,
-        )
-
-
-def _of_used(group: Int[np.ndarray, " packets"], n_groups: int) -> Buckets:
-    """Packets of each group, without those that fill up."""
-    used = np.append(np.flatnonzero(group < n_groups), len(group))
-    buckets = Buckets.of(group[group < n_groups], n_groups, 1.3)
-    return replace(buckets, rows=tuple(jnp.asarray(used[np.asarray(r)]) for r in buckets.rows))
-
-
-def _tied(columns: Int[np.ndarray, "packets shared"]) -> tuple[tuple[int, ...], ...]:
-    """Positions that hold the same unknown in every packet, together."""
-    together: dict[bytes, list[int]] = {}
-    for k, own in enumerate(columns.T):
-        together.setdefault(own.tobytes(), []).append(k)
-    return tuple(map(tuple, together.values()))
-
-
-def _split(at, local, s: int, d: int):
-    """Positions with shared and with local unknowns; None where they are not apart."""
-    used = local.any(axis=1)
-    is_local, is_shared = local.any(axis=0), (at < s).any(axis=0)
-    if (is_local & is_shared).any() or is_local.sum() != d:
-        return None
-    members = at[used][:, is_local] - s
-    if not (local[used][:, is_local].all() and (members % d == np.arange(d)).all()):
-        return None
-    return np.flatnonzero(is_shared), np.flatnonzero(is_local)
-
-
-def _pairs_in_groups(group, n_groups: int):
-    """All pairs of packets of one group: each with itself, and each two once."""
-    used = np.flatnonzero(group < n_groups)
-    member = used[_order(group[used], n_groups)]
-    count = np.bincount(group[used], minlength=n_groups)
-    first = np.cumsum(count) - count
-    left, right = [np.zeros(0, int)], [np.zeros(0, int)]
-    for size in np.unique(count[count > 0]):
-        start = first[count == size]
-        a, b = np.triu_indices(size)
-        left.append(member[(start[:, None] + a).ravel()])
-        right.append(member[(start[:, None] + b).ravel()])
-    return np.concatenate(left), np.concatenate(right)
+from jaxvm.solve.buckets import padded
+from jaxvm.solve.problem import Problem, assemble, flat_state, in_packets, whitened
+from jaxvm.solve.schur_pattern import SchurPattern, View
 
 
 @dataclass(frozen=True, eq=False)
@@ -371,7 +53,7 @@ class SchurNormal:
             for own in (view.packets.columns for view in self.pattern.views)
         ]
         by_shared = jnp.append(a, 1.0)[jnp.concatenate(columns)][:, None, :]
-        by_local = _padded(b)[self.pattern.group][:, :, None]
+        by_local = padded(b)[self.pattern.group][:, :, None]
         return replace(
             self,
             gradient=self.gradient * scale,
@@ -553,7 +235,7 @@ def _solved(pattern: SchurPattern, lower, half, reduced, right):
     s, n_groups, d = pattern.sizes
     a, b = right[:s], jnp.reshape(right[s:], (n_groups, d))
     forward = jnp.stack(_forward(lower, [b[:, k] for k in range(d)]), axis=1)
-    taken = jnp.sum(half * _padded(forward)[pattern.group][:, :, None], axis=1)
+    taken = jnp.sum(half * padded(forward)[pattern.group][:, :, None], axis=1)
     top = jnp.append(a, 0.0)
     for view, own in pattern.by_table(taken):
         top = top.at[view.columns].add(-view.views.sums(own[:, : view.columns.shape[1]]))
