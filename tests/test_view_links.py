@@ -11,7 +11,7 @@ from pose_networks import exponential
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from jaxvm.network.relations import matrices
+from jaxvm.geometry.matrices import matrices
 from jaxvm.network.scene import build
 from jaxvm.network.start import start
 from jaxvm.pose.chains import Link

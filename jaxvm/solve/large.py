@@ -81,9 +81,8 @@ def prepared(problem: Problem) -> tuple[Problem, Equations, Factors] | None:
     if s <= _DENSE and s * groups * d > _WIDE:
         pattern = SchurPattern.of(problem)
         if pattern is not None:
-            return *_unit(
-                problem, schur_normal(problem, pattern, jnp.zeros(problem.n))
-            ), SchurFactors(pattern)
+            normal = schur_normal(problem, pattern, jnp.zeros(problem.n))
+            return *_unit(problem, normal), SchurFactors(pattern)
     if not is_large(problem):
         return None
     pattern = Pattern.of(problem)
