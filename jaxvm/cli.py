@@ -183,9 +183,27 @@ def _parser() -> argparse.ArgumentParser:
     )
     montecarlo.add_argument("scene", help="as for simulate: an example by its name, or a TOML")
     montecarlo.add_argument("--trials", type=_positive, default=1000)
-    montecarlo.add_argument("--batch", type=_positive, default=128, help="trials at a time")
+    montecarlo.add_argument(
+        "--batch", type=_positive, default=None, help="trials at a time; found by measuring"
+    )
     montecarlo.add_argument("--seed", type=_natural, default=0, help="of the noise")
-    montecarlo.add_argument("--out", type=Path, default=None, metavar="DIR")
+    montecarlo.add_argument(
+        "--noise",
+        default="normal",
+        help="normal, student-t:FREEDOM, laplace, uniform or outliers:SHARE:FACTOR",
+    )
+    montecarlo.add_argument(
+        "--estimator",
+        choices=("gauss-newton", "levenberg-marquardt", "spgd"),
+        default="gauss-newton",
+    )
+    montecarlo.add_argument(
+        "--out",
+        type=Path,
+        default=None,
+        metavar="DIR",
+        help="where trials and tables are written; what was stopped there goes on",
+    )
 
     convert = command("convert", "make a recording of other programs' files")
     convert.add_argument(

@@ -253,14 +253,16 @@ def run_montecarlo(options):
     import jax
     import numpy as np
 
+    from jaxvm.montecarlo import ESTIMATORS, station_trials
+    from jaxvm.montecarlo.noise import noise_by_name
     from jaxvm.network.scene import build
     from jaxvm.recording.files import json_text, write_files
-    from jaxvm.scenes import read_description, simulate_network
+    from jaxvm.scenes import description_text, read_description, simulate_network
     from jaxvm.solve.compiling import keep_compiled
-    from jaxvm.solve.montecarlo import station_trials
 
     keep_compiled()
     progress = _progress(options)
+    noise = noise_by_name(options.noise)
     made = simulate_network(read_description(options.scene), noise=0.0)
     scene = build(made.recording)
     scene = scene.with_state(made.truth.state(scene))
@@ -273,9 +275,18 @@ def run_montecarlo(options):
         jax.random.key(options.seed),
         options.trials,
         options.batch,
-        lambda done: progress(f"{done} of {options.trials} trials"),
-        world,
+        lambda done: progress(str(done)),
+        folder=None if options.out is None else options.out / "trials",
+        world=world,
+        noise=noise,
+        estimator=ESTIMATORS[options.estimator](),
+        told={
+            "scene": description_text(options.scene),
+            "noise": options.noise,
+            "estimator": options.estimator,
+        },
     )
+    options.interruption.check()
     if found.failed.all():
         raise ValueError(
             f"none of {options.trials} trials converged: the noise is too large for this network; "
@@ -293,14 +304,19 @@ def run_montecarlo(options):
         "chi_square": found.chi_square,
         "variance_factor": float((2.0 * found.cost / found.degrees_of_freedom).mean()),
         "measured_over_predicted": spread,
+        "coverage_90": float(np.mean(found.results.statistics.coverage(0.9))),
+        "seconds": found.results.seconds,
+        "seconds_compiling": found.results.compiling,
+        "batch": found.results.batch,
         "hidden": list(made.truth.hidden),
     }
     text = "\n".join(
         [
-            f"trials             {options.trials}, of which failed {answer['failed']}",
+            found.results.summary(),
             f"variance factor    {answer['variance_factor']:.4f}",
             f"chi-square         {found.chi_square:.4f} of the errors, 1 where theory is right",
             "measured/predicted {least:.3f} to {largest:.3f}, median {median:.3f}".format(**spread),
+            f"coverage           {answer['coverage_90']:.4f} of the 90 % intervals",
             *([f"hidden             {', '.join(made.truth.hidden)}"] if made.truth.hidden else []),
         ]
     )
@@ -310,7 +326,7 @@ def run_montecarlo(options):
             "montecarlo.csv": frame.to_csv(index=False),
         }
         write_files(options.out, files)
-        text += f"\nwritten            {options.out}: {', '.join(files)}"
+        text += f"\nwritten            {options.out}: {', '.join(files)}, trials"
     return answer, text
 
 

@@ -183,5 +183,15 @@ def test_monte_carlo_of_a_described_network(tmp_path, capsys, monkeypatch):
     assert told["trials"] == 300 and told["failed"] == 0
     assert told["chi_square"] == pytest.approx(1.0, abs=4 * (2 / (18 * 300)) ** 0.5)
     assert len((out / "montecarlo.csv").read_text().splitlines()) == 1 + 6 * 3
+    assert told["coverage_90"] == pytest.approx(0.9, abs=0.05)
+    # More trials go on where the others ended.
+    asked[asked.index("300")] = "350"
+    assert main([*asked, "--json"]) == 0
+    said = capsys.readouterr()
+    assert "350 of 350 trials" in said.err and "100 of" not in said.err
+    assert main([*asked, "--noise", "student-t:5"]) == 2
+    assert "another study (study differ)" in capsys.readouterr().err
+    assert main([*asked, "--noise", "pink"]) == 2
+    assert 'no noise "pink"' in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main(["montecarlo", str(scene), "--trials", "0"])

@@ -2,8 +2,6 @@
 
 from dataclasses import replace
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -15,7 +13,6 @@ from scipy.stats import chi2
 
 from jaxvm.network.chordal import chordal_poses
 from jaxvm.network.cycles import fundamental_cycles
-from jaxvm.network.draw import drawn
 from jaxvm.network.graph import (
     PoseGraph,
     UnconnectedNetwork,
@@ -25,16 +22,12 @@ from jaxvm.network.graph import (
 from jaxvm.network.relations import held_poses, link_relations, pose_graph
 from jaxvm.network.scene import build
 from jaxvm.network.start import start
-from jaxvm.physics.effects import Effect, Term
-from jaxvm.recording.model import Prior
-from jaxvm.scenes import parse_description, simulate_network
 from jaxvm.solve import covariance as covariances
 from jaxvm.solve import large, snooping
 from jaxvm.solve.adjust import adjust
 from jaxvm.solve.condition import adjust_conditions
 from jaxvm.solve.covariance import covariance, pose_covariances, standard_deviations
 from jaxvm.solve.gauge import RankDeficiency
-from jaxvm.solve.montecarlo import montecarlo, station_trials
 from jaxvm.solve.problem import normal_at, scene_problem
 from jaxvm.solve.robust import HuberLoss
 from jaxvm.solve.selected import SelectedInverse, selected_inverse
@@ -284,31 +277,6 @@ def test_link_tests_are_chi_square():
     assert 0.02 < np.mean(pooled > chi2.isf(0.05, 6)) < 0.10
 
 
-def test_monte_carlo_agrees_with_theory(known):
-    scene = build(known.recording)
-    state = eqx.tree_at(lambda s: s.world_from_station, scene.state, jnp.asarray(known.truth))
-    found = montecarlo(
-        scene.with_state(state), lambda s: s.world_from_station[1:], jax.random.key(0), 1000, 250
-    )
-    assert not found.failed.any()
-    low, high = found.interval(0.9999)
-    assert (low < found.predicted).all() and (found.predicted < high).all()
-    n = found.errors.size
-    assert found.chi_square == pytest.approx(1.0, abs=4 * np.sqrt(2 / n))
-    squares = 2.0 * found.cost
-    spread = 4 * np.sqrt(2 * found.degrees_of_freedom / len(squares))
-    assert np.mean(squares) == pytest.approx(found.degrees_of_freedom, abs=spread)
-
-
-def test_monte_carlo_does_not_depend_on_the_batch(known):
-    scene = build(known.recording)
-    some = [
-        montecarlo(scene, lambda s: s.world_from_station[-1], jax.random.key(1), 40, batch)
-        for batch in (7, 40)
-    ]
-    assert np.allclose(some[0].errors, some[1].errors, rtol=1e-6, atol=1e-10)
-
-
 def test_conditions_and_the_network_residual_agree():
     """The same scene by cycles with dense matrices, and by all poses at once: to 1e-9."""
     known = network(seed=5)
@@ -341,40 +309,3 @@ def test_descents_reach_the_same_minimum(known, method, rel):
 def test_an_unknown_method_is_named(known):
     with pytest.raises(ValueError, match='no method "newton".*spgd, lbfgs'):
         adjust(build(known.recording), "newton")
-
-
-def test_priors_are_drawn_about_the_state_too(known):
-    """What is known beforehand is an observation: its error counts in the predicted covariance."""
-    sigma = np.repeat([1e-3, 2e-2], 3)
-    prior = Prior("stations.s3.pose", known.truth[3] + 7.0 * sigma, sigma)
-    recording = replace(known.recording, model=replace(known.recording.model, priors=(prior,)))
-    scene = build(recording)
-    state = eqx.tree_at(lambda s: s.world_from_station, scene.state, jnp.asarray(known.truth))
-    keys = jax.random.split(jax.random.key(0), 400)
-    drawing = jax.jit(jax.vmap(lambda key: drawn(scene.network, state, key).priors.expected))
-    expected = np.asarray(drawing(keys))
-    off = (expected - known.truth[3]) / sigma
-    assert np.abs(off.mean(axis=0)).max() < 4.0 / np.sqrt(400)
-    assert np.abs(off.std(axis=0) - 1.0).max() < 4.0 / np.sqrt(800)
-
-
-def test_hidden_physics_shows_in_monte_carlo():
-    """Measurements drawn from a world with a longer lens than the model believes."""
-    description = parse_description('layout = "chain"\nstations = 4')
-    made = simulate_network(description, noise=0.0)
-    scene = build(made.recording)
-    scene = scene.with_state(made.truth.state(scene))
-    effect = Effect("longer", (Term("sensor.focal"),), amplitudes=(5e-4,))
-    world = build(made.recording, (effect,))
-    true = made.truth.state(world)
-    world = world.with_state(eqx.tree_at(lambda s: s.amplitude, true, jnp.full(1, 5e-4)))
-    key = jax.random.key(3)
-    plain, frame = station_trials(scene, key, 200, 100)
-    hidden, _ = station_trials(scene, key, 200, 100, world=world)
-    assert list(frame.columns[:3]) == ["station", "epoch", "part"]
-    assert len(frame) == 6 * 3
-    assert plain.chi_square == pytest.approx(1.0, abs=0.15)
-    assert hidden.chi_square > 1.5 * plain.chi_square
-    # A longer lens brings everything nearer: the error is no noise.
-    bias = np.abs(hidden.errors.mean(axis=0)) / (hidden.predicted / np.sqrt(200))
-    assert bias.max() > 10.0

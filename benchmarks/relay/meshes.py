@@ -2,7 +2,7 @@
 
 Unadjusted is what one has without an adjustment: every station by the best path from the first
 (least sum of variances), in the same draws. Networks are scenes of stations that links alone join,
-adjusted by `jaxvm.solve.montecarlo`; a few draws of each are adjusted under the conditions of its
+adjusted by `jaxvm.montecarlo`; a few draws of each are adjusted under the conditions of its
 cycles too.
 
 Links are isotropic (20 µrad, 0.2 mm), tilted plates as far away as the stations are apart, or such
@@ -26,6 +26,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from jaxvm.geometry import pose_from_vector, so3_log
+from jaxvm.montecarlo import montecarlo
 from jaxvm.network.cycles import fundamental_cycles
 from jaxvm.network.draw import drawn as drawn_network
 from jaxvm.network.graph import (
@@ -42,7 +43,6 @@ from jaxvm.pose.relay import adjust_relay
 from jaxvm.recording.model import Model, Station
 from jaxvm.recording.recording import Links, Recording, no_observations
 from jaxvm.solve.condition import adjust_conditions
-from jaxvm.solve.montecarlo import montecarlo
 
 SEED = 4
 KINDS = ("isotropic", "plates", "plates both ways")

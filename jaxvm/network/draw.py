@@ -1,5 +1,6 @@
 """Measurements drawn about a state: the same prediction as everywhere, plus noise."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import equinox as eqx
@@ -12,13 +13,22 @@ from jaxvm.network.factors import Factor, LinkFactor, link_pose
 from jaxvm.network.residual import Network, parts_of, present, rows
 from jaxvm.network.state import State
 
+Noise = Callable[[PRNGKeyArray, tuple[int, ...]], Float[Array, "..."]]
+"""Numbers of zero mean and unit variance, of a key and a shape."""
 
-def drawn(network: Network, state: State, key: PRNGKeyArray, scale: float = 1.0) -> Network:
+
+def drawn(
+    network: Network,
+    state: State,
+    key: PRNGKeyArray,
+    scale: float = 1.0,
+    noise: Noise = jax.random.normal,
+) -> Network:
     """The network with measurements drawn anew about a state.
 
-    Every table gets its prediction at the state plus independent normal noise of its own sigmas
-    (or covariances) times `scale`; loop closures stay what they are. Pure: `jax.jit` and `jax.vmap`
-    apply.
+    Every table gets its prediction at the state plus independent noise of its own sigmas (or
+    covariances) times `scale`, normal by default; loop closures stay what they are. Pure: `jax.jit`
+    and `jax.vmap` apply.
     """
     flat = state.flatten()
     at = present(network, flat)
@@ -26,8 +36,8 @@ def drawn(network: Network, state: State, key: PRNGKeyArray, scale: float = 1.0)
 
     def off(factor: Factor) -> Float[Array, "observations components"]:
         """Predicted minus measured, plus noise."""
-        noise = jax.random.normal(next(keys), factor.sigma.shape)
-        return rows(factor, network, at) + scale * factor.sigma * noise
+        white = noise(next(keys), factor.sigma.shape)
+        return rows(factor, network, at) + scale * factor.sigma * white
 
     pixels = tuple(
         eqx.tree_at(
@@ -44,10 +54,12 @@ def drawn(network: Network, state: State, key: PRNGKeyArray, scale: float = 1.0)
         network = eqx.tree_at(lambda n: n.priors.expected, network, expected)
     if network.links is not None:
         own = _true_links(network.links, flat)
-        measured = _measured(own, network.links.root, next(keys), scale)
+        measured = _measured(own, network.links.root, scale * noise(next(keys), own.shape))
         network = eqx.tree_at(lambda n: n.links.measured, network, measured)
     if network.edges is not None:
-        measured = _measured(state.link, network.edges.root, next(keys), scale)
+        measured = _measured(
+            state.link, network.edges.root, scale * noise(next(keys), state.link.shape)
+        )
         network = eqx.tree_at(lambda n: n.edges.measured, network, measured)
     return network
 
@@ -74,9 +86,8 @@ def _true_links(factor: LinkFactor, flat) -> Float[Array, "links 6"]:
     return jax.vmap(one)(*parts_of(factor, flat))
 
 
-def _measured(true, root, key, scale) -> Float[Array, "links 6"]:
+def _measured(true, root, white) -> Float[Array, "links 6"]:
     """Measured poses whose twist log(measured^-1 . true) has the covariance (root^T root)^-1."""
-    white = scale * jax.random.normal(key, true.shape)
 
     def one(true, root, white):
         twist = jnp.linalg.solve(root, white)

@@ -5,8 +5,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxvm.geometry import hat, pose_from_vector, so3_log
+from jaxvm.geometry import Pose, hat, pose_from_vector, so3_log
+from jaxvm.network.draw import Noise
 from jaxvm.pose.monocular import locate
+from jaxvm.pose.refine import Refined
 from jaxvm.pose.sighting import Sighting
 from jaxvm.pose.station import Ranges, locate_from_station
 
@@ -71,40 +73,65 @@ def precision(setup: Setup, key: PRNGKeyArray, repetitions: int = 1000) -> Preci
 
     Pure: `jax.vmap` it over setups for a study over noise, distance, field or size.
     """
+    keys = jax.random.split(key, repetitions)
+    error = jax.vmap(lambda own: pose_error(setup, own))(keys)
+    return Precision(error, predicted_covariance(setup))
+
+
+def pose_error(
+    setup: Setup, key: PRNGKeyArray, noise: Noise = jax.random.normal
+) -> Float[Array, "6"]:
+    """Error of a pose measured once: (turn, shift) of the target's middle (rad, m).
+
+    Args:
+        noise: numbers of zero mean and unit variance, of a key and a shape.
+    """
+    pose, middle, image = _seen(setup)
+    of_image, of_range = jax.random.split(key)
+    pixels = image + noise(of_image, image.shape) * setup.sigma / setup.focal
+    # An infinite sigma whitens any noise to nothing.
+    spread = jnp.where(jnp.isfinite(setup.range_sigma), setup.range_sigma, 0.0)
+    distance = _rangefinder(setup).predicted(pose) + noise(of_range, (1,)) * spread
+    start = locate(Sighting(setup.points, pixels, _whitener(setup))).best
+    refined = _fused(setup, pixels, distance, start.observer_from_target)
+    found = pose_from_vector(refined.observer_from_target)
+    turn = so3_log(found.rotation @ pose.rotation.T)
+    centre = pose.inverse().apply(middle)
+    return jnp.concatenate([turn, found.apply(centre) - middle])
+
+
+def predicted_covariance(setup: Setup) -> Float[Array, "6 6"]:
+    """Covariance of `pose_error` that theory foretells."""
+    pose, middle, image = _seen(setup)
+    exact = _fused(setup, image, _rangefinder(setup).predicted(pose), setup.camera_from_target)
+    # From the camera's centre to the target's middle: d + w x m.
+    carry = jnp.eye(6).at[3:, :3].set(-hat(middle))
+    return carry @ exact.covariance @ carry.T
+
+
+def _seen(setup: Setup) -> tuple[Pose, Float[Array, "3"], Float[Array, "n 2"]]:
+    """True pose, middle of the target, and ideal image points."""
     pose = pose_from_vector(setup.camera_from_target)
     seen = jax.vmap(pose.apply)(setup.points)
-    middle = jnp.mean(seen, axis=0)
-    image = seen[:, :2] / seen[:, 2:]
-    whitener = jnp.broadcast_to(jnp.eye(2) * setup.focal / setup.sigma, (len(image), 2, 2))
-    far = Ranges(
+    return pose, jnp.mean(seen, axis=0), seen[:, :2] / seen[:, 2:]
+
+
+def _whitener(setup: Setup) -> Float[Array, "n 2 2"]:
+    return jnp.broadcast_to(jnp.eye(2) * setup.focal / setup.sigma, (len(setup.points), 2, 2))
+
+
+def _rangefinder(setup: Setup) -> Ranges:
+    return Ranges(
         station_from_rangefinder=jnp.zeros((1, 6)),
         point=jnp.zeros((1, 3)),
         to_plane=jnp.ones(1),
         distance=jnp.ones(1),
         sigma=jnp.ones(1) * setup.range_sigma,
     )
-    true_range = far.predicted(pose)
 
-    def fused(image, distance, start):
-        ranges = eqx.tree_at(lambda r: r.distance, far, distance)
-        one = jax.tree.map(lambda leaf: leaf[None], Sighting(setup.points, image, whitener))
-        return locate_from_station(one, jnp.zeros((1, 6)), ranges, start)
 
-    def once(key):
-        of_image, of_range = jax.random.split(key)
-        noise = jax.random.normal(of_image, image.shape) * setup.sigma / setup.focal
-        # An infinite sigma whitens any noise to nothing.
-        spread = jnp.where(jnp.isfinite(setup.range_sigma), setup.range_sigma, 0.0)
-        distance = true_range + jax.random.normal(of_range, (1,)) * spread
-        start = locate(Sighting(setup.points, image + noise, whitener)).best
-        refined = fused(image + noise, distance, start.observer_from_target)
-        found = pose_from_vector(refined.observer_from_target)
-        turn = so3_log(found.rotation @ pose.rotation.T)
-        centre = pose.inverse().apply(middle)
-        return jnp.concatenate([turn, found.apply(centre) - middle])
-
-    error = jax.vmap(once)(jax.random.split(key, repetitions))
-    exact = fused(image, true_range, setup.camera_from_target)
-    # From the camera's centre to the target's middle: d + w x m.
-    carry = jnp.eye(6).at[3:, :3].set(-hat(middle))
-    return Precision(error, carry @ exact.covariance @ carry.T)
+def _fused(setup: Setup, image, distance, start) -> Refined:
+    ranges = eqx.tree_at(lambda r: r.distance, _rangefinder(setup), distance)
+    own = Sighting(setup.points, image, _whitener(setup))
+    one = jax.tree.map(lambda leaf: leaf[None], own)
+    return locate_from_station(one, jnp.zeros((1, 6)), ranges, start)

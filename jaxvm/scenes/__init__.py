@@ -6,6 +6,7 @@ of its own, which shares no model with the network.
 
 from jaxvm.scenes.describe import (
     Description,
+    description_text,
     example_names,
     parse_description,
     read_description,
@@ -16,6 +17,7 @@ from jaxvm.scenes.truth import Simulated, Truth
 
 __all__ = [
     "Description",
+    "description_text",
     "LAYOUTS",
     "Layout",
     "Plan",

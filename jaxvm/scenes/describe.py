@@ -217,10 +217,24 @@ def read_description(scene: str | Path) -> Description:
         RecordingError: there is no such file or example, or something in it is wrong; names the
             file, the line and the mend.
     """
+    return parse_description(description_text(scene), described_in(scene))
+
+
+def described_in(scene: str | Path) -> str:
+    """Name of the TOML file of a network, or of an example."""
+    return Path(scene).name if Path(scene).is_file() else f"{scene}.toml"
+
+
+def description_text(scene: str | Path) -> str:
+    """The TOML of a network from its file, or of an example.
+
+    Raises:
+        RecordingError: there is no such file or example, or it is no text.
+    """
     name, path = str(scene), Path(scene)
     if name in example_names() and not path.is_file():
         file = resources.files("jaxvm.scenes").joinpath("examples", f"{name}.toml")
-        return parse_description(file.read_text(encoding="utf-8"), f"{name}.toml")
+        return file.read_text(encoding="utf-8")
     if not path.is_file():
         known = ", ".join(("deformation", *example_names()))
         raise RecordingError(
@@ -228,7 +242,7 @@ def read_description(scene: str | Path) -> Description:
             'write one, `layout = "chain"` is enough'
         )
     try:
-        return parse_description(path.read_text(encoding="utf-8"), path.name)
+        return path.read_text(encoding="utf-8")
     except UnicodeDecodeError:
         raise RecordingError(f"{path.name}: it is not a text in UTF-8; save it as one") from None
 

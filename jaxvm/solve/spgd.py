@@ -395,18 +395,16 @@ def minimise_spgd(
     """
     if not 0.0 <= momentum < 1.0:
         raise ValueError(f"a momentum of {momentum} never comes to rest (take 0 to below 1)")
-    n = jnp.sum(problem.active)
     none = -jnp.inf
-    solver = SPGD(
-        key=key,
+    solver = spgd_solver(
+        problem,
+        key,
         gain=TraceGain() if gain is None else gain,
         momentum=momentum,
-        trace=n.astype(float),
         target_cost=none if target_cost is None else target_cost,
         target_share=none if target_share is None else target_share,
         max_evaluations=max_evaluations,
         rtol=rtol,
-        patience=10 * n,
     )
     # The packets are for normal equations; without them fewer problems differ in shape.
     bare = eqx.tree_at(lambda p: p.packets, problem, ())
@@ -420,6 +418,12 @@ def minimise_spgd(
         stop=stats["stop"],
         limit=max_evaluations,
     )
+
+
+def spgd_solver(problem: Problem, key: PRNGKeyArray, **rules: Any) -> SPGD:
+    """The solver for a scaled problem: `rules` are attributes of `SPGD`."""
+    n = jnp.sum(problem.active)
+    return SPGD(key=key, trace=n.astype(float), patience=10 * n, **rules)
 
 
 def _cost(x: Float[Array, " n"], problem: Problem) -> Float[Array, ""]:

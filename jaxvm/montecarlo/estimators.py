@@ -1,0 +1,108 @@
+"""Estimators of a trial: from a problem, scaled and at its start, to unknowns. All are traced."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from jaxvm.solve.arrow import factorise
+from jaxvm.solve.descent import Stop
+from jaxvm.solve.optimise import levenberg_marquardt
+from jaxvm.solve.problem import Problem
+from jaxvm.solve.spgd import spgd_solver
+
+
+class Estimate(NamedTuple):
+    """What an estimator found.
+
+    Attributes:
+        x: unknowns of the problem.
+        cost: half the sum of (robust) squares there.
+        converged: whether it is an estimate.
+        evaluations: of normal equations, or of the cost.
+    """
+
+    x: Float[Array, " n"]
+    cost: Float[Array, ""]
+    converged: Bool[Array, ""]
+    evaluations: Int[Array, ""]
+
+
+Estimator = Callable[[Problem, PRNGKeyArray], Estimate]
+
+
+class GaussNewton(eqx.Module):
+    """Full steps until no unknown moves: for starts at or near the truth.
+
+    Attributes:
+        settled: change of a unit-diagonal unknown at which it has converged. Rounding moves weak
+            combinations by as much as 1e-7 where the condition number is 1e8.
+        most: bound on steps.
+    """
+
+    settled: Any = eqx.field(default=1e-6, converter=jnp.asarray)
+    most: Any = eqx.field(default=20, converter=jnp.asarray)
+
+    def __call__(self, problem: Problem, key: PRNGKeyArray) -> Estimate:
+        def step(state):
+            x, _, k = state
+            normal = problem.normal(x)
+            change = -factorise(normal.hessian).solve(normal.gradient)
+            return x + change, jnp.max(jnp.abs(change)), k + 1
+
+        def going(state):
+            _, change, k = state
+            return (change > self.settled) & (k < self.most)
+
+        start = jnp.zeros(problem.n), jnp.array(jnp.inf), jnp.array(0)
+        x, change, k = jax.lax.while_loop(going, step, start)
+        return Estimate(x, problem.cost(x), change <= self.settled, k)
+
+
+class LevenbergMarquardt(eqx.Module):
+    """Damped steps: for starts that may be far, and robust losses."""
+
+    limit: Any = eqx.field(default=100, converter=jnp.asarray)
+
+    def __call__(self, problem: Problem, key: PRNGKeyArray) -> Estimate:
+        solver = levenberg_marquardt(limit=self.limit)
+        found = optx.least_squares(
+            _residual, solver, jnp.zeros(problem.n), problem, max_steps=None, throw=False
+        )
+        evaluations = found.stats["evaluations"]
+        good = (found.result == optx.RESULTS.successful) & (evaluations < self.limit)
+        return Estimate(found.value, problem.cost(found.value), good, evaluations)
+
+
+def _residual(x: Float[Array, " n"], problem: Problem):
+    return problem.residual(x)
+
+
+class Spgd(eqx.Module):
+    """Stochastic parallel gradient descent, until the cost hardly falls any more or a limit."""
+
+    max_evaluations: Any = eqx.field(default=20_000, converter=jnp.asarray)
+    rtol: Any = eqx.field(default=1e-4, converter=jnp.asarray)
+
+    def __call__(self, problem: Problem, key: PRNGKeyArray) -> Estimate:
+        solver = spgd_solver(problem, key, max_evaluations=self.max_evaluations, rtol=self.rtol)
+        bare = eqx.tree_at(lambda p: p.packets, problem, ())
+        found = optx.minimise(
+            lambda x, own: own.cost(x), solver, jnp.zeros(problem.n), bare,
+            max_steps=None, throw=False,
+        )  # fmt: skip
+        x = jnp.where(problem.active, found.value, 0.0)
+        good = found.stats["stop"] != int(Stop.FAILED)
+        return Estimate(x, found.stats["cost"], good, found.stats["evaluations"])
+
+
+ESTIMATORS = {
+    "gauss-newton": GaussNewton,
+    "levenberg-marquardt": LevenbergMarquardt,
+    "spgd": Spgd,
+}
+"""Estimators of networks by name."""

@@ -1,0 +1,344 @@
+"""Running a study: batches, devices, a folder that a run is resumed from, progress."""
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pandas as pd
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh
+from jaxtyping import Bool, Float, Int, PRNGKeyArray
+
+from jaxvm.montecarlo.pace import Pace
+from jaxvm.montecarlo.statistics import Statistics
+from jaxvm.montecarlo.store import Store, columns_of, versions
+from jaxvm.montecarlo.trials import AXIS, Study, Trial
+from jaxvm.solve.compiling import compile_seconds
+
+_FLUSH_SECONDS, _FLUSH_SHARE = 1.0, 0.02
+"""Trials are written after a second, later on after a fiftieth of the time that has gone by: so
+much work a kill may cost, and a long run has some hundred files."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a run has come.
+
+    Attributes:
+        done, trials, failed: trials done so far (those found in the folder too), of how many, and
+            how many of them did not converge.
+        rate: trials per second of this run.
+        remaining: seconds that it will take at this rate.
+        batch: trials at a time.
+    """
+
+    done: int
+    trials: int
+    failed: int
+    rate: float
+    remaining: float
+    batch: int
+
+    def __str__(self) -> str:
+        failed = f", {self.failed} failed" if self.failed else ""
+        return (
+            f"{self.done} of {self.trials} trials{failed}, {self.rate:.3g} a second, "
+            f"{_duration(self.remaining)} left"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Results:
+    """What the trials of a study found.
+
+    Attributes:
+        names: of the numbers whose errors were counted, `NAME[k]`.
+        statistics: of the errors of the trials that converged.
+        done, failed: trials that are there, and those of them that did not converge.
+        ran: trials of this run; the others were in the folder.
+        trials: how many were asked for.
+        seconds, compiling: of this run.
+        batch: trials at a time in the end.
+        about: the study, its key, versions.
+        store: where they are on disk, if anywhere.
+    """
+
+    names: tuple[str, ...]
+    statistics: Statistics
+    done: int
+    failed: int
+    ran: int
+    trials: int
+    seconds: float
+    compiling: float
+    batch: int
+    about: dict[str, Any]
+    store: Store | None
+    _kept: tuple[tuple[Int[np.ndarray, " t"], Trial], ...]
+
+    @property
+    def complete(self) -> bool:
+        """Whether all trials are there; a run that was stopped is resumed from its folder."""
+        return self.done >= self.trials
+
+    def parts(self) -> Iterator[tuple[Int[np.ndarray, " t"], Trial]]:
+        """Numbers of trials and what they found, part by part."""
+        yield from self._kept if self.store is None else self.store.read()
+
+    @cached_property
+    def columns(self) -> dict[str, np.ndarray]:
+        """All trials as columns, in the order of their numbers (`jaxvm.montecarlo.store`)."""
+        parts = [columns_of(numbers, found) for numbers, found in self.parts()]
+        if not parts:
+            return {"trial": np.zeros(0, int), "converged": np.zeros(0, bool)}
+        joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        _, order = np.unique(joined["trial"], return_index=True)
+        return {name: values[order] for name, values in joined.items()}
+
+    def frame(self) -> pd.DataFrame:
+        """All trials, those that failed too, as a table."""
+        return pd.DataFrame(self.columns)
+
+    @property
+    def errors(self) -> Float[np.ndarray, "t m"]:
+        """Errors of the trials that converged, in the order of `names`."""
+        columns, ok = self.columns, self.columns["converged"]
+        return np.stack([columns[f"error.{name}"][ok] for name in self.names], axis=1)
+
+    @property
+    def failures(self) -> Int[np.ndarray, " failed"]:
+        """Numbers of the trials that did not converge: `study.batch(key, numbers, None)` runs them
+        again."""
+        return self.columns["trial"][~self.columns["converged"]]
+
+    def table(self, level: float = 0.95) -> pd.DataFrame:
+        """A row for each number: mean, RMS with its interval, quantiles, coverage."""
+        found = self.statistics
+        low, high = found.interval(level)
+        frame = pd.DataFrame({"quantity": self.names, "mean": found.mean, "rms": found.rms})
+        frame["low"], frame["high"] = low, high
+        for share in (0.05, 0.5, 0.95):
+            frame[f"q{100 * share:02.0f}"] = found.quantile(share)
+        frame["coverage_90"] = found.coverage(0.9)
+        return frame
+
+    def summary(self) -> str:
+        """A few lines."""
+        ran = max(self.seconds - self.compiling, 1e-9)
+        return "\n".join(
+            [
+                f"trials             {self.done} of {self.trials}, of which failed {self.failed}",
+                f"time               {self.seconds:.2f} s, of which compiling"
+                f" {self.compiling:.2f} s; batches of {self.batch}, {self.ran / ran:.4g} a second",
+            ]
+        )
+
+    def to_xarray(self):
+        """All trials as an `xarray.Dataset` over the dimension `trial`.
+
+        Raises:
+            ModuleNotFoundError: xarray is not installed (`pip install jaxvm[netcdf]`).
+        """
+        import xarray  # pyright: ignore[reportMissingImports]
+
+        from jaxvm.montecarlo.store import trial_of
+
+        numbers, found = trial_of(self.columns)
+        variables: dict[str, Any] = {
+            "converged": ("trial", found.converged),
+            **{name: ("trial", values) for name, values in found.noted.items()},
+        }
+        for group, values in (("error", found.error), ("sigma", found.sigma)):
+            for name, own in values.items():
+                variables[f"{group}_{name}"] = (("trial", f"{name}_component"), own)
+        return xarray.Dataset(variables, {"trial": numbers}, {"study": str(self.about)})
+
+    def save(self, path: str | Path) -> Path:
+        """Write all trials to one file, `.parquet` or `.nc` (NetCDF).
+
+        Raises:
+            ValueError: another kind of file.
+        """
+        path = Path(path)
+        if path.suffix == ".parquet":
+            self.frame().to_parquet(path, index=False)
+        elif path.suffix == ".nc":
+            self.to_xarray().to_netcdf(path, engine="h5netcdf")
+        else:
+            raise ValueError(f"{path}: trials are written as .parquet or .nc")
+        return path
+
+
+def run(
+    study: Study,
+    seed: int | PRNGKeyArray,
+    trials: int,
+    *,
+    folder: str | Path | None = None,
+    batch: int | None = None,
+    mesh: Mesh | None = None,
+    progress: Callable[[Progress], None] | None = None,
+    stop: Callable[[], bool] | None = None,
+) -> Results:
+    """Run the trials 0 to `trials` - 1 of a study.
+
+    Trial k is the same whatever the number of trials, the batch and the devices, but for rounding.
+    With more than one process (`jax.distributed`) all of them call this; the first one writes.
+
+    Args:
+        study: see `jaxvm.montecarlo.trials`.
+        seed: of all randomness: a number or a key.
+        trials: how many.
+        folder: where trials are written; a run that was stopped or killed there goes on. Without
+            it they stay in memory.
+        batch: trials at a time; found by measuring if not given.
+        mesh: devices to share trials out to, one axis `trials`; all there are by default.
+        progress: told after each batch.
+        stop: asked after each batch whether to stop. An interruption (Ctrl-C) stops, too; what is
+            done is written, and returned.
+
+    Raises:
+        FileExistsError: the folder holds another study, or other files.
+        ValueError: fewer than one trial or batch.
+    """
+    if trials < 1 or (batch is not None and batch < 1):
+        raise ValueError("at least one trial, and one in a batch, are due")
+    key = jax.random.key(seed) if isinstance(seed, int) else seed
+    if mesh is None and jax.device_count() > 1:
+        mesh = Mesh(np.array(jax.devices()), (AXIS,))
+    about = {
+        "study": study.about(),
+        "key": np.asarray(jax.random.key_data(key)).tolist(),
+        "versions": versions(),
+    }
+    first = jax.process_index() == 0
+    store = Store(folder, about) if folder is not None and first else None
+    gathered = _Gathered(store, trials)
+    left = np.flatnonzero(~_agreed(gathered.there))
+    pace = Pace(batch, 1 if mesh is None else mesh.size, len(left))
+    began, compiled, so_far = time.perf_counter(), compile_seconds(), gathered.done
+    try:
+        at = 0
+        while at < len(left):
+            size = int(_agreed(np.array(pace.batch)))
+            numbers = left[at : at + size]
+            before, compiling = time.perf_counter(), compile_seconds()
+            # All batches have the same size; the last one repeats its last trial.
+            filled = np.concatenate([numbers, np.full(size - len(numbers), numbers[-1])])
+            found = _fetched(study.batch(key, filled, mesh))
+            found = _first(found, len(numbers))
+            at += len(numbers)
+            now = time.perf_counter()
+            pace.batch = size
+            pace.note(now - before, compile_seconds() - compiling, len(left) - at)
+            gathered.add(numbers, found, now - began)
+            if progress is not None and first:
+                running = now - began - (compile_seconds() - compiled)
+                rate = (gathered.done - so_far) / max(running, 1e-9)
+                remaining = (len(left) - at) / rate
+                progress(Progress(gathered.done, trials, gathered.failed, rate, remaining, size))
+            if _agreed(np.array(stop is not None and stop())):
+                break
+    except KeyboardInterrupt:
+        pass
+    finally:
+        gathered.flush()
+    return Results(
+        names=gathered.names,
+        statistics=gathered.statistics,
+        done=gathered.done,
+        failed=gathered.failed,
+        ran=gathered.done - so_far,
+        trials=trials,
+        seconds=time.perf_counter() - began,
+        compiling=compile_seconds() - compiled,
+        batch=pace.batch,
+        about=about,
+        store=store,
+        _kept=tuple(gathered.kept),
+    )
+
+
+class _Gathered:
+    """Trials that are there: counted, and written or kept."""
+
+    def __init__(self, store: Store | None, trials: int):
+        self.store = store
+        self.there: Bool[np.ndarray, " trials"] = np.zeros(trials, bool)
+        self.done = self.failed = 0
+        self.names: tuple[str, ...] = ()
+        self.statistics = Statistics(0)
+        self.kept: list[tuple[np.ndarray, Trial]] = []  # since the last flush, or all
+        self._flushed = 0.0
+        for numbers, found in store.read() if store is not None else ():
+            self._count(numbers, found)
+
+    def add(self, numbers: np.ndarray, found: Trial, seconds: float) -> None:
+        self._count(numbers, found)
+        self.kept.append((numbers, found))
+        if seconds - self._flushed > max(_FLUSH_SECONDS, _FLUSH_SHARE * seconds):
+            self.flush()
+            self._flushed = seconds
+
+    def flush(self) -> None:
+        if self.store is None or not self.kept:
+            return
+        numbers = np.concatenate([numbers for numbers, _ in self.kept])
+        found = jax.tree.map(lambda *parts: np.concatenate(parts), *(f for _, f in self.kept))
+        self.store.write(numbers, found)
+        self.kept.clear()
+
+    def _count(self, numbers: np.ndarray, found: Trial) -> None:
+        parts = {name: np.asarray(e) for name, e in found.error.items()}
+        errors = np.concatenate(list(parts.values()), axis=1)
+        sigma = np.concatenate(
+            [
+                np.asarray(found.sigma.get(name, np.full_like(e, np.nan)))
+                for name, e in parts.items()
+            ],
+            axis=1,
+        )
+        if not self.names:
+            self.names = tuple(
+                f"{name}[{k}]" for name, e in parts.items() for k in range(e.shape[1])
+            )
+            self.statistics = Statistics(len(self.names))
+        # More may be in the folder than this run asks for, and some of it twice.
+        own, index = np.unique(numbers, return_index=True)
+        index = index[own < len(self.there)]
+        index = index[~self.there[numbers[index]]]
+        self.there[numbers[index]] = True
+        good = np.asarray(found.converged)[index]
+        self.done += len(index)
+        self.failed += int((~good).sum())
+        self.statistics.add(errors[index][good], sigma[index][good])
+
+
+def _first(found: Trial, n: int) -> Trial:
+    return jax.tree.map(lambda leaf: leaf[:n], found)
+
+
+def _fetched(found: Trial) -> Trial:
+    """On the host, whole, in every process."""
+    if jax.process_count() > 1:
+        found = multihost_utils.process_allgather(found, tiled=True)
+    return jax.tree.map(np.asarray, found)
+
+
+def _agreed(value: np.ndarray) -> np.ndarray:
+    """What the first process says."""
+    if jax.process_count() == 1:
+        return value
+    return np.asarray(multihost_utils.broadcast_one_to_all(value))
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 100.0:
+        return f"{seconds:.0f} s"
+    minutes = seconds / 60.0
+    return f"{minutes:.0f} min" if minutes < 100.0 else f"{minutes / 60.0:.1f} h"

@@ -1,0 +1,129 @@
+"""Trials on disk: a folder of Parquet files that a study is resumed from.
+
+    study.json        what the study is, its key, versions
+    trials-0000.parquet, trials-0001.parquet, ...
+
+A part appears complete or not at all, so whatever ends a run, what was written counts. Columns are
+`trial`, `converged`, `error.NAME[k]`, `sigma.NAME[k]` and what was noted.
+"""
+
+import json
+import os
+import platform
+import tempfile
+from collections.abc import Iterator, Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from jaxtyping import Int
+
+from jaxvm.montecarlo.trials import Trial
+from jaxvm.recording.files import json_text, write_files
+
+_MANIFEST = "study.json"
+
+
+def columns_of(numbers: Int[np.ndarray, " t"], found: Trial) -> dict[str, np.ndarray]:
+    """Stacked trials as columns."""
+    columns = {"trial": np.asarray(numbers, np.int64), "converged": np.asarray(found.converged)}
+    for group, values in (("error", found.error), ("sigma", found.sigma)):
+        for name, own in values.items():
+            for k, column in enumerate(np.asarray(own).T):
+                columns[f"{group}.{name}[{k}]"] = np.ascontiguousarray(column)
+    return columns | {name: np.asarray(value) for name, value in found.noted.items()}
+
+
+def trial_of(columns: Mapping[str, np.ndarray]) -> tuple[Int[np.ndarray, " t"], Trial]:
+    """The inverse of `columns_of`."""
+    groups: dict[str, dict[str, list[np.ndarray]]] = {"error": {}, "sigma": {}}
+    noted = {}
+    for column, values in columns.items():
+        group, _, rest = column.partition(".")
+        if group in groups and rest.endswith("]"):
+            groups[group].setdefault(rest[: rest.rindex("[")], []).append(values)
+        elif column not in ("trial", "converged"):
+            noted[column] = values
+    error, sigma = (
+        {name: np.stack(parts, axis=1) for name, parts in groups[group].items()}
+        for group in ("error", "sigma")
+    )
+    return columns["trial"], Trial(error, columns["converged"].astype(bool), sigma, noted)
+
+
+class Store:
+    """The folder of one study."""
+
+    def __init__(self, folder: str | Path, manifest: Mapping[str, Any]):
+        """Open a folder, new or begun by the same study.
+
+        Raises:
+            FileExistsError: it holds another study, or other files.
+        """
+        self.folder = Path(folder)
+        self.manifest = json.loads(json_text(dict(manifest)))
+        place = self.folder / _MANIFEST
+        if place.exists():
+            there = json.loads(place.read_text(encoding="utf-8"))
+            other = [
+                name
+                for name in sorted(there.keys() | self.manifest.keys())
+                if name != "versions" and there.get(name) != self.manifest.get(name)
+            ]
+            if other:
+                raise FileExistsError(
+                    f"{place}: the trials here are of another study ({', '.join(other)} differ); "
+                    "choose another folder, or remove this one"
+                )
+        elif self.folder.exists() and any(self.folder.iterdir()):
+            raise FileExistsError(
+                f"{self.folder} holds other files and no {_MANIFEST}; choose another folder"
+            )
+        else:
+            write_files(self.folder, {_MANIFEST: json_text(dict(manifest))})
+
+    def parts(self) -> list[Path]:
+        """Files of trials, in the order in which they were written."""
+        return sorted(self.folder.glob("trials-*.parquet"))
+
+    def write(self, numbers: Int[np.ndarray, " t"], found: Trial) -> None:
+        """Add a part; it is on the disk when this returns."""
+        columns = columns_of(numbers, found)
+        table = pa.table(columns).replace_schema_metadata({"study": json.dumps(self.manifest)})
+        handle, staging = tempfile.mkstemp(prefix=".writing-", dir=self.folder)
+        try:
+            with os.fdopen(handle, "wb") as file:
+                pq.write_table(table, file, compression="zstd")
+                file.flush()
+                os.fsync(file.fileno())
+            last = self.parts()[-1:]
+            number = int(last[0].stem.rpartition("-")[2]) + 1 if last else 0
+            os.replace(staging, self.folder / f"trials-{number:04d}.parquet")
+        except BaseException:
+            Path(staging).unlink(missing_ok=True)
+            raise
+
+    def read(self) -> Iterator[tuple[Int[np.ndarray, " t"], Trial]]:
+        """Trials part by part.
+
+        Raises:
+            ValueError: a part can't be read.
+        """
+        for part in self.parts():
+            try:
+                table = pq.read_table(part)
+            except (OSError, pa.ArrowInvalid) as error:
+                raise ValueError(
+                    f"{part} can't be read ({error}); remove it, and its trials are run again"
+                ) from error
+            columns = {n: table[n].to_numpy(zero_copy_only=False) for n in table.column_names}
+            yield trial_of(columns)
+
+
+def versions() -> dict[str, str]:
+    """What computed: the package, JAX, NumPy, Python."""
+    found = {name: version(name) for name in ("jaxvm", "jax", "numpy")}
+    return {**found, "python": platform.python_version()}
