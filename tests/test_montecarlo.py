@@ -1,12 +1,7 @@
 """Monte Carlo: statistics against NumPy, any batch and device, stopped and killed and resumed."""
 
-import os
 import signal
-import socket
-import subprocess
-import sys
 import time
-from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -17,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pose_networks import network
+from processes import EIGHT, answer, apart, together
 from scipy.stats import chi2, kurtosis
 
 from jaxvm.discover.hypotheses import enumerate_hypotheses
@@ -46,8 +42,6 @@ from jaxvm.pose.precision import Setup
 from jaxvm.recording.model import Prior
 from jaxvm.scenes import parse_description, simulate_network
 from jaxvm.solve.adjust import adjust
-
-HERE = Path(__file__).parent
 
 
 @pytest.fixture(scope="module")
@@ -413,24 +407,8 @@ def test_the_pace_grows_while_that_pays():
     assert short.batch == 64
 
 
-def apart(*arguments, **environment):
-    return subprocess.Popen(
-        [sys.executable, str(HERE / "trials_apart.py"), *map(str, arguments)],
-        env=os.environ | environment,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-
-
-def answer(process) -> list[str]:
-    """What it said last."""
-    said = process.communicate()[0]
-    assert process.returncode == 0
-    return said.splitlines()[-1].split()
-
-
 def test_a_killed_run_loses_nothing_that_was_written(tmp_path):
-    killed = apart(tmp_path / "trials", 400, 10, 0.4)
+    killed = apart("trials", tmp_path / "trials", 400, 10, 0.4)
     deadline = time.monotonic() + 120.0
     while not list((tmp_path / "trials").glob("trials-0001.parquet")):
         assert killed.poll() is None and time.monotonic() < deadline
@@ -439,7 +417,7 @@ def test_a_killed_run_loses_nothing_that_was_written(tmp_path):
     killed.communicate()
     there = pd.concat(map(pd.read_parquet, sorted((tmp_path / "trials").glob("*.parquet"))))
     assert there["trial"].is_unique and 0 < len(there) < 400
-    _, ran, good, *rms = answer(apart(tmp_path / "trials", 400, 100))
+    _, ran, good, *rms = answer(apart("trials", tmp_path / "trials", 400, 100, 0))
     assert int(ran) == 400 - len(there) and int(good) == 400
     frame = pd.concat(map(pd.read_parquet, sorted((tmp_path / "trials").glob("*.parquet"))))
     assert sorted(frame["trial"]) == list(range(400))
@@ -449,15 +427,10 @@ def test_a_killed_run_loses_nothing_that_was_written(tmp_path):
 
 def test_eight_devices_and_two_processes_give_the_numbers_of_one(tmp_path):
     """Shared out over devices with JAX's own mesh, and over processes on loopback."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    eight = "--xla_force_host_platform_device_count=8"
-    two = [apart(tmp_path / "two", 50, 20, 0, port, rank, 2) for rank in (0, 1)]
-    answers = [answer(own) for own in two]
-    one = answer(apart(tmp_path / "one", 50, 50))
-    many = answer(apart(tmp_path / "eight", 50, 16, XLA_FLAGS=eight))
-    assert [one[0], many[0], answers[0][0]] == ["1", "8", "2"]
+    two = together("trials", tmp_path / "two", 50, 20, 0)
+    one = answer(apart("trials", tmp_path / "one", 50, 50, 0))
+    many = answer(apart("trials", tmp_path / "eight", 50, 16, 0, XLA_FLAGS=EIGHT))
+    assert [one[0], many[0], two[0]] == ["1", "8", "2"]
     frames = [
         pd.concat(map(pd.read_parquet, (tmp_path / name).glob("*.parquet"))).sort_values("trial")
         for name in ("one", "eight", "two")

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+from jax.sharding import Mesh
 
 from jaxvm.network.residual import Residuals, residual
 from jaxvm.network.scene import Scene
@@ -19,6 +20,7 @@ from jaxvm.solve.lbfgs import minimise_lbfgs
 from jaxvm.solve.optimise import METHODS, minimise
 from jaxvm.solve.problem import Problem, normal_at, scaled, scene_problem
 from jaxvm.solve.robust import Loss, SquaredLoss
+from jaxvm.solve.sharing import SharedProblem
 from jaxvm.solve.spgd import minimise_spgd
 
 
@@ -138,6 +140,7 @@ def adjust(
     max_steps: int = 100,
     repeats: int = 8,
     check: bool = True,
+    mesh: Mesh | None = None,
 ) -> Adjustment:
     """Adjust a scene: find the free parameters that minimise the whitened residuals.
 
@@ -158,17 +161,19 @@ def adjust(
         max_steps: bound on evaluations, each time.
         repeats: how often it may be repeated about the patterns of effects at the solution.
         check: look for rank deficiency first.
+        mesh: devices to share the observations out to (`jaxvm.solve.sharing`); one axis
+            "observations". Not for sparse factors, which are on the host.
 
     Raises:
         RankDeficiency: unknowns that the observations don't determine, by name.
-        ValueError: an unknown method.
+        ValueError: an unknown method, or a mesh with other axes.
     """
     known = (*METHODS, *DESCENTS)
     if method not in known:
         raise ValueError(f'there is no method "{method}" (there are: {", ".join(known)})')
     began, compiling = time.perf_counter(), compile_seconds()
     options: dict = dict(weights=weights, range_weights=range_weights, link_weights=link_weights)
-    options |= dict(active=active, loss=loss)
+    options |= dict(active=active, loss=loss, mesh=mesh)
     options |= dict(rtol=rtol, damping=damping, max_steps=max_steps)
     found = _adjusted(scene, method, check=check, **options)
     before = np.inf
@@ -225,6 +230,7 @@ def _adjusted(
     damping,
     max_steps,
     check,
+    mesh,
 ) -> Adjustment:
     """The adjustment with the patterns of the start values."""
     problem = scene_problem(scene, loss)
@@ -238,7 +244,7 @@ def _adjusted(
         problem = eqx.tree_at(lambda p: p.network.links.weight, problem, jnp.asarray(link_weights))
     if active is not None:
         problem = eqx.tree_at(lambda p: p.active, problem, problem.active & jnp.asarray(active))
-    if (host := prepared(problem)) is not None:
+    if mesh is None and (host := prepared(problem)) is not None:
         return _adjusted_large(scene, *host, method, rtol, damping, max_steps, check)
     problem, normal = scaled(problem, normal_at(problem, jnp.zeros(problem.n)))
     if check:
@@ -248,7 +254,8 @@ def _adjusted(
     solver = METHODS[method](
         jnp.asarray(rtol), limit=jnp.asarray(max_steps), damping=jnp.asarray(damping)
     )
-    x, last = minimise(problem, normal, solver)
+    shared = problem if mesh is None else SharedProblem.of(problem, mesh)
+    x, last = minimise(shared, normal, solver)
     history = np.asarray(last.history)
     return _result(
         scene,

@@ -6,7 +6,7 @@ optimistix's descents (Newton, damped Newton) and searches (learning rate, trust
 rest.
 """
 
-from typing import Any
+from typing import Any, Protocol
 
 import equinox as eqx
 import jax
@@ -15,9 +15,15 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxvm.solve.arrow import ArrowCholesky
-from jaxvm.solve.problem import Normal, Problem, normal_at
+from jaxvm.solve.problem import Normal, normal_at
 
 _HISTORY = 512
+
+
+class HasNormal(Protocol):
+    """What gives normal equations: a problem, or one that is shared out to devices."""
+
+    def normal(self, x: Any) -> Normal: ...
 
 
 class _State(eqx.Module):
@@ -139,7 +145,7 @@ class NormalEquationSolver(optx.AbstractLeastSquaresSolver):
         }  # fmt: skip
 
 
-def minimise(problem: Problem, normal: Normal, solver: NormalEquationSolver):
+def minimise(problem: HasNormal, normal: Normal, solver: NormalEquationSolver):
     """Drive a solver from x = 0, where the normal equations are known already.
 
     The same as `optimistix.least_squares`, step by step from outside, so that the one compiled
@@ -152,7 +158,7 @@ def minimise(problem: Problem, normal: Normal, solver: NormalEquationSolver):
     y, state = _begin(solver, info)
     y, state = _advance(solver, y, state, info)
     while not bool(state.done):
-        y, state = _advance(solver, y, state, _as_info(normal_at(problem, state.trial)))
+        y, state = _advance(solver, y, state, _as_info(problem.normal(state.trial)))
     return y, state
 
 
