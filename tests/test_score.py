@@ -11,7 +11,7 @@ from test_steps import dense
 from jaxvm.discover.hypotheses import enumerate_hypotheses, member
 from jaxvm.discover.noise import multipliers
 from jaxvm.discover.ranking import surprise
-from jaxvm.discover.score import ScoreTests
+from jaxvm.discover.score import ScoreTests, _whitener
 from jaxvm.network.residual import residual
 from jaxvm.physics.drivers import OWN_BODY
 from jaxvm.physics.effects import Effect, Scope, Term
@@ -117,3 +117,14 @@ def test_a_surprise_is_the_log_of_a_tail():
         for statistic in (columns + 30.0, columns + 200.0):
             told = surprise(np.array(statistic), columns)
             assert told == pytest.approx(-2.0 * chi2.logsf(statistic, columns), rel=0.2)
+
+
+def test_rounding_of_what_is_absorbed_stops_nothing():
+    """Information with an eigenvalue below zero: the other directions count as they did."""
+    rng = np.random.default_rng(0)
+    axes = np.linalg.qr(rng.normal(size=(4, 4)))[0]
+    sound, broken = ((axes * [1.0, 0.3, 0.1, last]) @ axes.T for last in (0.05, -3e-8))
+    found = _whitener(np.stack([sound, broken]))
+    assert np.allclose(found[0].T @ found[0], np.linalg.inv(sound), rtol=1e-6)
+    inverse = (axes[:, :3] / [1.0, 0.3, 0.1]) @ axes[:, :3].T
+    assert np.allclose(found[1].T @ found[1], inverse, rtol=1e-6, atol=1e-9)

@@ -283,7 +283,7 @@ def _information(
     size = np.diagonal(gram, axis1=1, axis2=2)
     unit = 1.0 / np.sqrt(np.where(size > 0.0, size, 1.0))
     scaled = information * unit[:, :, None] * unit[:, None, :]
-    root = np.linalg.cholesky(scaled + _ABSORBED * np.eye(columns))
+    whitener = _whitener(scaled)
     seen = np.diagonal(scaled, axis1=1, axis2=2).max(axis=1)
     of_epoch = gathered(np.einsum("nkk->n", square), place.epoch)  # E w
     carried = np.einsum("ebw,ew->be", part.by_epoch**2, of_epoch, optimize=True)
@@ -292,7 +292,22 @@ def _information(
     n_carrying = total**2 / np.maximum(np.sum(carried**2, axis=1), 1e-300)
     fewest = min(FEWEST_EPOCHS, 0.5 * len(place.epoch))
     sound = valid & (seen > 1e-6) & (total > 0.0) & (n_carrying >= fewest)
-    return _Information(np.linalg.inv(root) * unit[:, None, :], seen, sound)
+    return _Information(whitener * unit[:, None, :], seen, sound)
+
+
+def _whitener(information: Float[np.ndarray, "b k k"]) -> Float[np.ndarray, "b k k"]:
+    """W with W^T W the inverse of what information is left, and nearly nothing along the rest.
+
+    What the model absorbs leaves rounding behind, whose eigenvalues may be negative where the model
+    itself is badly conditioned.
+    """
+    try:
+        root = np.linalg.cholesky(information + _ABSORBED * np.eye(information.shape[-1]))
+        return np.linalg.inv(root)
+    except np.linalg.LinAlgError:
+        values, vectors = np.linalg.eigh(information)
+        size = np.sqrt(np.where(values > _ABSORBED, values + _ABSORBED, np.inf))
+        return np.swapaxes(vectors / size[:, None, :], 1, 2)
 
 
 @dataclass(frozen=True)
