@@ -36,7 +36,9 @@ Estimator = Callable[[Problem, PRNGKeyArray], Estimate]
 
 
 class GaussNewton(eqx.Module):
-    """Full steps until no unknown moves: for starts at or near the truth.
+    """Full steps until no unknown would move any more: for starts at or near the truth.
+
+    The next step is foretold from the last two, which shrink by at least the same factor again.
 
     Attributes:
         settled: change of a unit-diagonal unknown at which it has converged. Rounding moves weak
@@ -49,18 +51,19 @@ class GaussNewton(eqx.Module):
 
     def __call__(self, problem: Problem, key: PRNGKeyArray) -> Estimate:
         def step(state):
-            x, _, k = state
+            x, before, _, k = state
             normal = problem.normal(x)
             change = -factorise(normal.hessian).solve(normal.gradient)
-            return x + change, jnp.max(jnp.abs(change)), k + 1
+            size = jnp.max(jnp.abs(change))
+            return x + change, size, size * jnp.minimum(size / before, 1.0), k + 1
 
         def going(state):
-            _, change, k = state
-            return (change > self.settled) & (k < self.most)
+            _, _, ahead, k = state
+            return (ahead > self.settled) & (k < self.most)
 
-        start = jnp.zeros(problem.n), jnp.array(jnp.inf), jnp.array(0)
-        x, change, k = jax.lax.while_loop(going, step, start)
-        return Estimate(x, problem.cost(x), change <= self.settled, k)
+        start = jnp.zeros(problem.n), jnp.array(0.0), jnp.array(jnp.inf), jnp.array(0)
+        x, _, ahead, k = jax.lax.while_loop(going, step, start)
+        return Estimate(x, problem.cost(x), ahead <= self.settled, k)
 
 
 class LevenbergMarquardt(eqx.Module):

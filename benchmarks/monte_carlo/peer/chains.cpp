@@ -87,7 +87,7 @@ int main(int argc, char** argv) {
   std::vector<double> found(trials * width);
   ceres::Solver::Options options;
   options.linear_solver_type = ceres::DENSE_NORMAL_CHOLESKY;
-  options.function_tolerance = 1e-10;
+  options.function_tolerance = argc > 7 ? std::atof(argv[7]) : 1e-6;
   options.logging_type = ceres::SILENT;
   options.num_threads = 1;
   std::printf("{\"ceres\": \"%s\", \"trials\": %zu, \"seconds\": [", CERES_VERSION_STRING, trials);
