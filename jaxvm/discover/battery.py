@@ -5,13 +5,13 @@ hypotheses are kept by scope, each with the cells that it acts on and no others.
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from jaxvm.discover.cells import Arrangement, gathered, padded_lists
 from jaxvm.discover.hypotheses import Family
+from jaxvm.discover.once import once
 from jaxvm.network.binding import in_scope, ranges_in_scope
 from jaxvm.network.scene import Scene
 from jaxvm.physics.effects import Scope, evaluate
@@ -68,17 +68,17 @@ class Part:
     place: Place
     weights: Float[np.ndarray, "b bases n"]
 
-    @cached_property
+    @once
     def by_group(self) -> Float[np.ndarray, "groups b_bases width"]:
         """Weights gathered by local group."""
         return np.moveaxis(gathered(self._flat, self.place.group), 1, 0)
 
-    @cached_property
+    @once
     def by_epoch(self) -> Float[np.ndarray, "epochs b_bases wide"]:
         """Weights gathered by epoch."""
         return np.moveaxis(gathered(self._flat, self.place.epoch), 1, 0)
 
-    @cached_property
+    @once
     def within(self) -> Float[np.ndarray, "b bases bases groups_width_width"] | None:
         """Products of the weights of two cells of a group; None where they would be too many."""
         b, n_bases, _ = self.weights.shape

@@ -18,9 +18,10 @@ independence inside an epoch (wild bootstrap of the scores).
 """
 
 import os
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from functools import cached_property
+from itertools import islice
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -28,14 +29,18 @@ from jaxtyping import Bool, Float
 from jaxvm.discover.battery import Battery, Part, battery
 from jaxvm.discover.cells import Arrangement, Cells, arrange, gathered
 from jaxvm.discover.hypotheses import Family
+from jaxvm.discover.once import once
 from jaxvm.discover.ranking import Ranking, Scores, surprise
 from jaxvm.network.scene import Scene
-from jaxvm.physics.drivers import pattern
+from jaxvm.physics.drivers import OBSERVATION_DRIVERS, driven_by, pattern
 from jaxvm.physics.ports import PORT_INDEX
 from jaxvm.solve.adjust import Adjustment
 
 _ABSORBED = 1e-8
 """Relative information below which a direction counts as absorbed by the model."""
+
+_STACKED = 16
+"""Groups whose tangents are multiplied at a time."""
 
 FEWEST_EPOCHS = 3.0
 """A hypothesis that fewer epochs carry than this can't be told from a few bad images."""
@@ -72,7 +77,18 @@ class ScoreTests:
 
     def at(self, fit: Adjustment) -> "ScoreTests":
         """Tests of the same hypotheses at another fit of the same recording."""
-        return ScoreTests(fit.scene, arrange(fit), self.battery)
+        found = ScoreTests(fit.scene, arrange(fit), self.battery)
+        if np.array_equal(found.arrangement.rows, self.arrangement.rows):
+            old, new = self.arrangement.drivers, found.arrangement.drivers
+            moved = {
+                name
+                for k, name in enumerate(OBSERVATION_DRIVERS)
+                if not np.array_equal(old[:, k], new[:, k], equal_nan=True)
+            }
+            # Where the image and the marks are does not change with the fit: nor do most patterns.
+            same = {key: p for key, p in self._patterns.items() if not moved & driven_by(key[0])}
+            found._patterns.update(same)
+        return found
 
     def score(
         self,
@@ -110,8 +126,7 @@ class ScoreTests:
         inflation, freedom, sound = np.ones(shape), np.ones(shape), np.zeros(shape, bool)
         amplitude = np.zeros((*shape, family.n_terms * family.n_bases))
         null = np.full((shape[0], tested.repetitions), -np.inf)
-        for g, own in enumerate(self._ports_and_patterns(family)):
-            tangents = _Tangents.of(self.arrangement.cells, *own)
+        for g, tangents in enumerate(self._tangents(family)):
             product = tangents.product(tested.residual)
             for p, part in enumerate(parts):
                 here = g, part.courses, part.scope
@@ -135,21 +150,34 @@ class ScoreTests:
         found = drop, z, amplitude, seen, inflation, freedom, null, sound
         return Scores(family, *found, tested.variance)
 
-    def _ports_and_patterns(self, family: Family):
-        """Port numbers [terms] and patterns [terms, cells, observations] of each group."""
+    def _tangents(self, family: Family) -> Iterator["_Tangents"]:
+        """Tangents of each group, stacked some at a time: what all cells share is read once."""
+        cells, groups = self.arrangement.cells, iter(family.groups)
+        while some := tuple(islice(groups, _STACKED)):
+            terms = [(g, term) for g, group in enumerate(some) for term in group.terms]
+            stack = np.empty((cells.residual.shape[0], len(terms), cells.residual.shape[1]))
+            for k, (g, term) in enumerate(terms):
+                own = self._pattern(term, some[g].mark)
+                np.multiply(cells.tangent[PORT_INDEX[term.port]], own, out=stack[:, k])
+                if term.weight != 1.0:
+                    stack[:, k] *= term.weight
+            together = _Tangents(cells, stack, None, 0)
+            first = 0
+            for group in some:
+                last = first + len(group.terms)
+                yield _Tangents(cells, stack[:, first:last], together, first)
+                first = last
+
+    def _pattern(self, term, mark: tuple[int, int] | None) -> Float[np.ndarray, "cells rows"]:
+        """Pattern of a term over the rows of the cells, of one mark or of all."""
         arrangement, known = self.arrangement, self._patterns
-        for group in family.groups:
-            patterns = []
-            for term in group.terms:
-                key = (term.driver, term.basis, term.constants)
-                if key not in known:
-                    values = np.append(np.asarray(pattern(term, arrangement.drivers)), 0.0)
-                    known[key] = values[arrangement.rows]
-                own = known[key]
-                if group.mark is not None:
-                    own = own * self._mark_mask(group.mark)
-                patterns.append(own * term.weight)
-            yield np.array([PORT_INDEX[term.port] for term in group.terms]), np.stack(patterns)
+        key = (term.driver, term.basis, term.constants)
+        if key not in known:
+            values = np.append(np.asarray(pattern(term, arrangement.drivers)), 0.0)
+            known[key] = np.repeat(values[arrangement.rows], arrangement.components, axis=1)
+        if mark is None:
+            return known[key]
+        return known[key] * np.repeat(self._mark_mask(mark), arrangement.components, axis=1)
 
     def _mark_mask(self, mark: tuple[int, int]) -> np.ndarray:
         obs, arrangement = self.scene.recording.observations, self.arrangement
@@ -197,27 +225,28 @@ class _Tested:
 
 @dataclass(frozen=True)
 class _Tangents:
-    """Tangents of one group, before its courses, and their products in each cell."""
+    """Tangents of one group, before its courses, and their products in each cell.
+
+    Attributes:
+        stack: those of several groups, these from the term `first` on; None for a stack itself.
+    """
 
     cells: Cells
     tangent: Float[np.ndarray, "cells terms rows"]
+    stack: "_Tangents | None"
+    first: int
 
-    @classmethod
-    def of(cls, cells: Cells, ports: np.ndarray, patterns: np.ndarray) -> "_Tangents":
-        """The tangents of some ports with patterns over the observations of the cells."""
-        components = cells.residual.shape[1] // patterns.shape[2]
-        tangent = cells.tangent[ports] * np.repeat(patterns, components, axis=2)
-        return cls(cells, np.ascontiguousarray(np.moveaxis(tangent, 1, 0)))
-
-    @cached_property
+    @once
     def square(self) -> Float[np.ndarray, "cells terms terms"]:
         """Products among themselves."""
         return self.tangent @ np.swapaxes(self.tangent, 1, 2)
 
-    @cached_property
+    @once
     def halves(self) -> Float[np.ndarray, "cells terms halves"]:
         """Products with J L^-T."""
-        return self.tangent @ self.cells.half
+        if self.stack is None:
+            return self.tangent @ self.cells.half
+        return self.stack.halves[:, self.first : self.first + self.tangent.shape[1]]
 
     def product(self, residual: np.ndarray) -> Float[np.ndarray, "cells terms"]:
         """Products with residuals in each cell."""

@@ -207,6 +207,11 @@ def range_drivers(
     return jnp.stack([known.get(name, jnp.full((), jnp.nan)) for name in OBSERVATION_DRIVERS])
 
 
+def driven_by(driver: str) -> set[str]:
+    """Columns of a table of drivers that a pattern of this driver reads."""
+    return set(PLANES[driver][:2]) if driver in PLANES else {driver}
+
+
 def pattern(
     term: Term, drivers: Float[Array | np.ndarray, "observations drivers"]
 ) -> Float[Array, " observations"]:
