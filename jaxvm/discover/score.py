@@ -29,10 +29,10 @@ from jaxtyping import Bool, Float
 from jaxvm.discover.battery import Battery, Part, battery
 from jaxvm.discover.cells import Arrangement, Cells, arrange, gathered
 from jaxvm.discover.hypotheses import Family
-from jaxvm.discover.once import once
 from jaxvm.discover.ranking import Ranking, Scores, surprise
 from jaxvm.network.scene import Scene
-from jaxvm.physics.drivers import OBSERVATION_DRIVERS, driven_by, pattern
+from jaxvm.physics.drivers import OBSERVATION_DRIVERS, driven_by, patterns
+from jaxvm.physics.effects import Term
 from jaxvm.physics.ports import PORT_INDEX
 from jaxvm.solve.adjust import Adjustment
 
@@ -41,6 +41,9 @@ _ABSORBED = 1e-8
 
 _STACKED = 16
 """Groups whose tangents are multiplied at a time."""
+
+_CELLS = 64
+"""Cells of which they are."""
 
 FEWEST_EPOCHS = 3.0
 """A hypothesis that fewer epochs carry than this can't be told from a few bad images."""
@@ -112,8 +115,8 @@ class ScoreTests:
         cells = self.arrangement.cells
         e = cells.residual if residual is None else self.arrangement.in_cells(residual)
         tested = _Tested.of(cells, e, variance, signs, studentised)
-        # NumPy lets other threads run while it multiplies. All that families share is patterns,
-        # and those that two of them make at once are equal.
+        self._evaluate_patterns()
+        # NumPy lets other threads run while it multiplies.
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             each = pool.map(lambda f: self._of_family(f, tested), range(len(self.battery.families)))
             scores = tuple(each)
@@ -126,8 +129,15 @@ class ScoreTests:
         inflation, freedom, sound = np.ones(shape), np.ones(shape), np.zeros(shape, bool)
         amplitude = np.zeros((*shape, family.n_terms * family.n_bases))
         null = np.full((shape[0], tested.repetitions), -np.inf)
-        for g, tangents in enumerate(self._tangents(family)):
-            product = tangents.product(tested.residual)
+        wanted = [
+            (number, g, p)
+            for p, part in enumerate(parts)
+            for g in np.flatnonzero(family.valid[:, part.courses, part.scope].any(axis=1))
+        ]
+        # Where the information is known and no signs are flipped, products with residuals do.
+        full = tested.flips or any(key not in self._known for key in wanted)
+        for g, tangents in enumerate(self._tangents(family, tested.residual, full)):
+            product = tangents.product
             for p, part in enumerate(parts):
                 here = g, part.courses, part.scope
                 if not family.valid[here].any():
@@ -150,34 +160,60 @@ class ScoreTests:
         found = drop, z, amplitude, seen, inflation, freedom, null, sound
         return Scores(family, *found, tested.variance)
 
-    def _tangents(self, family: Family) -> Iterator["_Tangents"]:
-        """Tangents of each group, stacked some at a time: what all cells share is read once."""
-        cells, groups = self.arrangement.cells, iter(family.groups)
-        while some := tuple(islice(groups, _STACKED)):
-            terms = [(g, term) for g, group in enumerate(some) for term in group.terms]
-            stack = np.empty((cells.residual.shape[0], len(terms), cells.residual.shape[1]))
-            for k, (g, term) in enumerate(terms):
-                own = self._pattern(term, some[g].mark)
-                np.multiply(cells.tangent[PORT_INDEX[term.port]], own, out=stack[:, k])
-                if term.weight != 1.0:
-                    stack[:, k] *= term.weight
-            together = _Tangents(cells, stack, None, 0)
-            first = 0
-            for group in some:
-                last = first + len(group.terms)
-                yield _Tangents(cells, stack[:, first:last], together, first)
-                first = last
+    def _tangents(self, family: Family, residual: np.ndarray, full: bool) -> Iterator["_Tangents"]:
+        """Products of the tangents of each group, some groups and some cells at a time.
 
-    def _pattern(self, term, mark: tuple[int, int] | None) -> Float[np.ndarray, "cells rows"]:
-        """Pattern of a term over the rows of the cells, of one mark or of all."""
-        arrangement, known = self.arrangement, self._patterns
-        key = (term.driver, term.basis, term.constants)
-        if key not in known:
-            values = np.append(np.asarray(pattern(term, arrangement.drivers)), 0.0)
-            known[key] = np.repeat(values[arrangement.rows], arrangement.components, axis=1)
-        if mark is None:
-            return known[key]
-        return known[key] * np.repeat(self._mark_mask(mark), arrangement.components, axis=1)
+        What is multiplied stays in the cache, and what all groups share is read once for some.
+        """
+        cells, arrangement, groups = self.arrangement.cells, self.arrangement, iter(family.groups)
+        n, height = residual.shape
+        index = np.repeat(arrangement.rows, arrangement.components, axis=1)
+        while some := tuple(islice(groups, _STACKED)):
+            terms = [(group, term) for group in some for term in group.terms]
+            ends = np.cumsum([len(group.terms) for group in some])
+            own = [self._pattern(term, group.mark) for group, term in terms]
+            different = {id(values): values for values in own}
+            ports = [PORT_INDEX[term.port] for _, term in terms]
+            product = np.empty((n, len(terms)))
+            halves = np.empty((n, len(terms), cells.half.shape[2])) if full else None
+            square = [np.empty((n, len(group.terms), len(group.terms))) for group in some]
+            stack = np.empty((_CELLS, len(terms), height))
+            for first in range(0, n, _CELLS):
+                here = slice(first, min(first + _CELLS, n))
+                piece = stack[: min(_CELLS, n - first)]
+                patterns = {at: values[index[here]] for at, values in different.items()}
+                for k, (values, port) in enumerate(zip(own, ports, strict=True)):
+                    tangent = cells.tangent[port, here]
+                    np.multiply(tangent, patterns[id(values)], out=piece[:, k])
+                product[here] = (piece @ residual[here, :, None])[:, :, 0]
+                if halves is not None:
+                    np.matmul(piece, cells.half[here], out=halves[here])
+                    for g, end in enumerate(ends):
+                        group = piece[:, end - square[g].shape[1] : end]
+                        np.matmul(group, np.swapaxes(group, 1, 2), out=square[g][here])
+            for g, end in enumerate(ends):
+                at = slice(end - square[g].shape[1], end)
+                half = None if halves is None else halves[:, at]
+                yield _Tangents(cells.n_local, square[g], half, product[:, at])
+
+    def _pattern(self, term, mark: tuple[int, int] | None) -> Float[np.ndarray, " observations_1"]:
+        """Pattern of a term over all observations, of one mark or of all; a zero at the end."""
+        own = self._patterns[_key(term)]
+        own = own if mark is None else own * self._mark_mask(mark)
+        return own if term.weight == 1.0 else term.weight * own
+
+    def _evaluate_patterns(self) -> None:
+        """Those that are not known yet, all of a driver and a basis at a time."""
+        alike: dict[tuple, dict[tuple, Term]] = {}
+        for family in self.battery.families:
+            for group in family.groups:
+                for term in group.terms:
+                    if _key(term) not in self._patterns:
+                        alike.setdefault((term.driver, term.basis), {})[_key(term)] = term
+        for terms in alike.values():
+            values = np.asarray(patterns(tuple(terms.values()), self.arrangement.drivers))
+            ended = np.concatenate([values.T, np.zeros((len(terms), 1))], axis=1)
+            self._patterns.update(zip(terms, ended, strict=True))
 
     def _mark_mask(self, mark: tuple[int, int]) -> np.ndarray:
         obs, arrangement = self.scene.recording.observations, self.arrangement
@@ -186,7 +222,7 @@ class ScoreTests:
             own[start : start + len(rows)] = (obs.target[rows] == mark[0]) & (
                 obs.point[rows] == mark[1]
             )
-        return own[arrangement.rows]
+        return own
 
 
 @dataclass(frozen=True)
@@ -225,36 +261,34 @@ class _Tested:
 
 @dataclass(frozen=True)
 class _Tangents:
-    """Tangents of one group, before its courses, and their products in each cell.
+    """Products of the tangents of one group, before its courses, in each cell.
 
     Attributes:
-        stack: those of several groups, these from the term `first` on; None for a stack itself.
+        n_local: columns of `halves` that belong to local unknowns.
+        square: among themselves.
+        halves: with J L^-T; None where they are not wanted.
+        product: with the residuals.
     """
 
-    cells: Cells
-    tangent: Float[np.ndarray, "cells terms rows"]
-    stack: "_Tangents | None"
-    first: int
-
-    @once
-    def square(self) -> Float[np.ndarray, "cells terms terms"]:
-        """Products among themselves."""
-        return self.tangent @ np.swapaxes(self.tangent, 1, 2)
-
-    @once
-    def halves(self) -> Float[np.ndarray, "cells terms halves"]:
-        """Products with J L^-T."""
-        if self.stack is None:
-            return self.tangent @ self.cells.half
-        return self.stack.halves[:, self.first : self.first + self.tangent.shape[1]]
-
-    def product(self, residual: np.ndarray) -> Float[np.ndarray, "cells terms"]:
-        """Products with residuals in each cell."""
-        return (self.tangent @ residual[:, :, None])[:, :, 0]
+    n_local: int
+    square: Float[np.ndarray, "cells terms terms"]
+    halves: Float[np.ndarray, "cells terms halves"] | None
+    product: Float[np.ndarray, "cells terms"]
 
     def shared(self, part: Part) -> Float[np.ndarray, "b columns shared"]:
         """What the shared unknowns see of each course."""
-        return _summed(part, self.halves[part.place.cells][:, :, self.cells.n_local :])
+        assert self.halves is not None
+        return _summed(part, _at(self.halves[:, :, self.n_local :], part.place.cells))
+
+
+def _key(term: Term) -> tuple:
+    """What the pattern of a term depends on."""
+    return term.driver, term.basis, term.constants
+
+
+def _at(values: np.ndarray, cells: np.ndarray) -> np.ndarray:
+    """Values of some cells, in ascending order; of all of them without a copy."""
+    return values if len(cells) == len(values) else values[cells]
 
 
 def _summed(part: Part, values: Float[np.ndarray, "n terms ..."]) -> np.ndarray:
@@ -279,8 +313,8 @@ def _information(
     Few large matrix products, in NumPy: a compiled program for every shape of a family would take
     longer to make than to run.
     """
-    weights, place, d = part.weights, part.place, tangents.cells.n_local
-    square = tangents.square[place.cells]
+    weights, place, d = part.weights, part.place, tangents.n_local
+    square = _at(tangents.square, place.cells)
     b, n_bases, n = weights.shape
     k = square.shape[1]
     columns = k * n_bases
@@ -295,7 +329,8 @@ def _information(
         gram = gram.reshape(b, columns, columns)
     information = gram - shared @ np.swapaxes(shared, 1, 2)
     if d:
-        own = tangents.halves[place.cells][:, :, :d]
+        assert tangents.halves is not None
+        own = _at(tangents.halves[:, :, :d], place.cells)
         padded = np.concatenate([own, np.zeros((1, k, d))])[place.group]
         if part.within is not None:
             alike = np.einsum("gvkd,gwld->gvwkl", padded, padded, optimize=True)
@@ -356,7 +391,7 @@ class _Information:
 
 def _drop(known: _Information, part: Part, product: np.ndarray):
     """Drop of chi-square [b] and one-step amplitudes [b, columns]."""
-    score = _summed(part, product[part.place.cells])
+    score = _summed(part, _at(product, part.place.cells))
     score = np.einsum("bdc,bc->bd", known.whitener, score)
     return np.sum(score**2, axis=1), -np.einsum("bdc,bd->bc", known.whitener, score)
 
@@ -367,7 +402,9 @@ def _flipped(
     """Inflation and freedom of each course [b], and the largest z of each repetition."""
     place, sound = part.place, known.sound
     b, columns, _ = shared.shape
-    padded = np.concatenate([product[place.cells], np.zeros((1, product.shape[1]))])[place.epoch]
+    padded = np.concatenate([_at(product, place.cells), np.zeros((1, product.shape[1]))])[
+        place.epoch
+    ]
     scores = _by_terms(np.moveaxis(part.by_epoch @ padded, 0, 2), part)  # b c E
     scores = known.whitener[sound] @ (scores[sound] - shared[sound] @ tested.pull.T)
     # A fitted residual lacks what the shared unknowns take of its epoch, about 1/epochs.

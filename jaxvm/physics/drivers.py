@@ -8,6 +8,7 @@ residuals explains noise. (A mark at rest shows noise e at phase phi; e sin 2 pi
 average out.)
 """
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -17,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxvm.geometry.poses import pose_from_vector
-from jaxvm.physics.blocks import by_blocks, hosted
+from jaxvm.physics.blocks import by_blocks, hosted, roomy
 from jaxvm.physics.chain import Aim, Circumstances, Sight, predict_range
 from jaxvm.physics.effects import Channels, Term
 from jaxvm.physics.forms import BASES, bump
@@ -216,37 +217,50 @@ def pattern(
     term: Term, drivers: Float[Array | np.ndarray, "observations drivers"]
 ) -> Float[Array, " observations"]:
     """Pattern of one term over a table of observations; 0 where its driver has no meaning (NaN)."""
-    constants = np.array((*term.constants, 1.0, 1.0)[:2], float)
+    return patterns((term,), drivers)[:, 0]
+
+
+def patterns(
+    terms: Sequence[Term], drivers: Float[Array | np.ndarray, "observations drivers"]
+) -> Float[Array, "observations terms"]:
+    """Patterns of terms with one driver and one basis, which differ in their constants."""
+    driver, basis = terms[0].driver, terms[0].basis
+    constants = np.array([(*term.constants, 1.0, 1.0)[:2] for term in terms], float)
     (table,) = hosted(drivers)
-    if term.driver in PLANES:
-        x_name, y_name, width = PLANES[term.driver]
+    if driver in PLANES:
+        x_name, y_name, width = PLANES[driver]
         columns = [OBSERVATION_DRIVER_INDEX[name] for name in (x_name, y_name)]
         x = table[:, np.array(columns)]
-        tile, wave = partial(_spot, width=width), partial(_wave, name=term.basis)
-        evaluate, known = tile if term.basis == "tile" else wave, jnp.isfinite(x).all(axis=1)
+        tile, wave = partial(_spots, width=width), partial(_waves, name=basis)
+        evaluate, known = tile if basis == "tile" else wave, jnp.isfinite(x).all(axis=1)
     else:
-        x = table[:, OBSERVATION_DRIVER_INDEX[term.driver]]
-        evaluate, known = partial(_basis, name=term.basis), jnp.isfinite(x)
+        x = table[:, OBSERVATION_DRIVER_INDEX[driver]]
+        evaluate, known = partial(_bases, name=basis), jnp.isfinite(x)
     (known,) = hosted(known)
-    values = by_blocks(evaluate, x, constants)
+    # Few numbers of terms are few programs.
+    values = by_blocks(evaluate, x, roomy(constants, least=1))[:, : len(terms)]
     where: Any = np.where if isinstance(values, np.ndarray) else jnp.where
-    return where(known, values, 0.0)
+    return where(known[:, None], values, 0.0)
 
 
 @partial(jax.jit, static_argnames="name")
-def _basis(x, constants, name: str):
+def _bases(x, constants, name: str):
     x = jnp.where(jnp.isfinite(x), x, 0.0)
-    return BASES[name](x, x, constants)
+    return jax.vmap(lambda own: BASES[name](x, x, own), out_axes=1)(constants)
 
 
 @partial(jax.jit, static_argnames="name")
-def _wave(x, constants, name: str):
-    return BASES[name](x @ constants, x[:, 0], jnp.ones(2))
+def _waves(x, constants, name: str):
+    ones = jnp.ones(2)
+    return jax.vmap(lambda own: BASES[name](x @ own, x[:, 0], ones), out_axes=1)(constants)
 
 
 @jax.jit
-def _spot(x, constants, width):
-    return bump(x[:, 0], constants[0], width) * bump(x[:, 1], constants[1], width)
+def _spots(x, constants, width):
+    def one(own):
+        return bump(x[:, 0], own[0], width) * bump(x[:, 1], own[1], width)
+
+    return jax.vmap(one, out_axes=1)(constants)
 
 
 def build_channels(
