@@ -261,6 +261,23 @@ def test_poses_are_covered_as_foretold():
     assert np.abs(found.statistics.coverage(0.9) - 0.9).max() < error
 
 
+def test_single_precision_is_enough_for_poses():
+    """Rounding a pixel of 2,000 by 1e-4 adds nothing to a noise of 0.2: errors are as foretold."""
+    rng = np.random.default_rng(0)
+    points = jnp.asarray(rng.uniform(-1.0, 1.0, (20, 3)))
+    pose = jnp.array([0.3, 0.2, -0.1, 0.0, 0.0, 10.0])
+    study = pose_study(Setup(points, pose, jnp.asarray(2000.0), jnp.asarray(0.2)))
+    double, single = (run(own, 1, 1000) for own in (study, study.in_single_precision()))
+    assert single.columns["error.shift[0]"].dtype == np.float32
+    assert double.columns["error.shift[0]"].dtype == np.float64
+    assert single.failed == 0 and single.about["study"]["precision"] == "float32"
+    sigma = np.array([double.columns[f"sigma.{name}"][0] for name in double.names])
+    own = np.array([single.columns[f"sigma.{name}"][0] for name in single.names])
+    assert np.allclose(own, sigma, rtol=1e-3)
+    for found in (double, single):
+        assert np.abs(found.statistics.rms / sigma - 1.0).max() < 4.0 / np.sqrt(2 * 1000)
+
+
 def test_scores_of_noise_are_chi_square(tmp_path):
     from networks import stereo_recording
 

@@ -24,12 +24,13 @@ class Pace:
 
     Attributes:
         batch: trials of the next batch; a multiple of the devices.
+        found: whether it stays what it is.
     """
 
     def __init__(self, batch: int | None, devices: int = 1, trials: int = _LARGEST):
         """`batch` fixes it; None lets it be found."""
         self._devices = devices
-        self._fixed = batch is not None
+        self.found = batch is not None
         first = min(_FIRST * devices, max(trials, 1))
         self.batch = self._whole(first if batch is None else batch)
         self._seconds: dict[int, float] = {}  # of a trial, the best of each size
@@ -38,7 +39,7 @@ class Pace:
 
     def note(self, seconds: float, compiling: float, left: int) -> None:
         """Learn what the last batch took, and choose the next one for what is left to do."""
-        if self._fixed:
+        if self.found:
             return
         own = max(seconds - compiling, 1e-9) / self.batch
         fresh = self.batch not in self._seconds
@@ -47,13 +48,13 @@ class Pace:
             # The first run of a program warms up; the second one counts.
             return
         if self._before and self._seconds[self.batch] * _GAIN > self._seconds[self._before]:
-            self.batch, self._fixed = self._before, True
+            self.batch, self.found = self._before, True
             return
         larger = self._whole(self.batch * _FACTOR)
         grown = _FACTOR * max(_peak() - self._memory, 0)
         cheap = left * self._seconds[self.batch] > _WORTH * compiling
         if larger > _LARGEST or 2 * larger > left or not cheap or grown > 0.5 * _room():
-            self._fixed = True
+            self.found = True
             return
         self._before, self.batch = self.batch, larger
 

@@ -1,11 +1,14 @@
 """Running a study: batches, devices, a folder that a run is resumed from, progress."""
 
+import os
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -17,7 +20,7 @@ from jaxtyping import Bool, Float, Int, PRNGKeyArray
 from jaxvm.montecarlo.pace import Pace
 from jaxvm.montecarlo.statistics import Statistics
 from jaxvm.montecarlo.store import Store, columns_of, versions
-from jaxvm.montecarlo.trials import AXIS, Study, Trial
+from jaxvm.montecarlo.trials import AXIS, Study, Traced, Trial
 from jaxvm.solve.compiling import compile_seconds
 
 _FLUSH_SECONDS, _FLUSH_SHARE = 1.0, 0.02
@@ -220,33 +223,41 @@ def run(
     store = Store(folder, about) if folder is not None and first else None
     gathered = _Gathered(store, trials)
     left = np.flatnonzero(~_agreed(gathered.there))
+    batch = getattr(study, "together", None) if batch is None else batch
     pace = Pace(batch, 1 if mesh is None else mesh.size, len(left))
+    # A processor works at several batches at a time: none keeps all of its cores busy.
+    cores = os.cpu_count() or 1 if mesh is None and isinstance(study, Traced) and _on_host() else 1
     began, compiled, so_far = time.perf_counter(), compile_seconds(), gathered.done
+    pool, waiting, at = ThreadPoolExecutor(cores), deque[_Batch](), 0
     try:
-        at = 0
-        while at < len(left):
+        while at < len(left) or waiting:
             size = int(_agreed(np.array(pace.batch)))
-            numbers = left[at : at + size]
+            while at < len(left) and len(waiting) < (cores if pace.found else 1):
+                numbers = left[at : at + size]
+                at += len(numbers)
+                # All batches have the same size; the last one repeats its last trial.
+                filled = np.concatenate([numbers, np.full(size - len(numbers), numbers[-1])])
+                work = partial(study.batch, key, filled, mesh)
+                waiting.append(_Batch(numbers, work if cores == 1 else pool.submit(work).result))
+            numbers, work = waiting.popleft()
             before, compiling = time.perf_counter(), compile_seconds()
-            # All batches have the same size; the last one repeats its last trial.
-            filled = np.concatenate([numbers, np.full(size - len(numbers), numbers[-1])])
-            found = _fetched(study.batch(key, filled, mesh))
-            found = _first(found, len(numbers))
-            at += len(numbers)
+            found = _first(_fetched(work()), len(numbers))
             now = time.perf_counter()
+            undone = len(left) - at + sum(len(other.numbers) for other in waiting)
             pace.batch = size
-            pace.note(now - before, compile_seconds() - compiling, len(left) - at)
+            pace.note(now - before, compile_seconds() - compiling, undone)
             gathered.add(numbers, found, now - began)
             if progress is not None and first:
                 running = now - began - (compile_seconds() - compiled)
                 rate = (gathered.done - so_far) / max(running, 1e-9)
-                remaining = (len(left) - at) / rate
-                progress(Progress(gathered.done, trials, gathered.failed, rate, remaining, size))
+                told = Progress(gathered.done, trials, gathered.failed, rate, undone / rate, size)
+                progress(told)
             if _agreed(np.array(stop is not None and stop())):
                 break
     except KeyboardInterrupt:
         pass
     finally:
+        pool.shutdown(cancel_futures=True)
         gathered.flush()
     return Results(
         names=gathered.names,
@@ -262,6 +273,13 @@ def run(
         store=store,
         _kept=tuple(gathered.kept),
     )
+
+
+class _Batch(NamedTuple):
+    """Trials that are under way, and what waits for them."""
+
+    numbers: Int[np.ndarray, " t"]
+    work: Callable[[], Trial]
 
 
 class _Gathered:
@@ -328,6 +346,10 @@ def _fetched(found: Trial) -> Trial:
     if jax.process_count() > 1:
         found = multihost_utils.process_allgather(found, tiled=True)
     return jax.tree.map(np.asarray, found)
+
+
+def _on_host() -> bool:
+    return jax.default_backend() == "cpu"
 
 
 def _agreed(value: np.ndarray) -> np.ndarray:

@@ -33,6 +33,8 @@ class ScoreStudy:
     noise: Noise
     told: dict[str, Any]
 
+    together = 4
+
     def about(self) -> dict[str, Any]:
         return self.told
 

@@ -11,6 +11,11 @@ from scipy.stats import chi2, norm
 LEVELS = (0.5, 0.6827, 0.9, 0.95, 0.99)
 """Levels of the two-sided intervals whose coverage is counted."""
 
+_DEVIATIONS = norm.ppf(0.5 + 0.5 * np.array(LEVELS))
+
+_WAITING = 1 << 18
+"""Numbers that are kept until they are counted in bins."""
+
 _ACCURACY = 0.002
 _GROWTH = np.log((1.0 + _ACCURACY) / (1.0 - _ACCURACY))
 _SMALLEST = 1e-30
@@ -30,7 +35,8 @@ class Statistics:
         self.mean = np.zeros(m)
         self._scatter = np.zeros((m, m))
         self.least, self.largest = np.full(m, np.inf), np.full(m, -np.inf)
-        self._bins: dict[int, int] = {}
+        self._codes, self._times = np.zeros(0, np.int64), np.zeros(0, np.int64)
+        self._waiting: list[Int[np.ndarray, " codes"]] = []
         self._inside = np.zeros((len(LEVELS), m), int)
         self._judged = np.zeros(m, int)
 
@@ -48,13 +54,14 @@ class Statistics:
         self.count = total
         self.least = np.minimum(self.least, values.min(axis=0))
         self.largest = np.maximum(self.largest, values.max(axis=0))
-        for code, times in zip(*np.unique(_codes(values), return_counts=True), strict=True):
-            self._bins[int(code)] = self._bins.get(int(code), 0) + int(times)
+        self._waiting.append(_codes(values))
+        if sum(map(len, self._waiting)) > max(_WAITING, 4 * len(self._codes)):
+            self._sort()
         if sigma is not None:
             told = np.isfinite(sigma)
             self._judged += told.sum(axis=0)
-            for k, level in enumerate(LEVELS):
-                inside = np.abs(values) <= norm.ppf(0.5 + 0.5 * level) * sigma
+            for k, deviations in enumerate(_DEVIATIONS):
+                inside = np.abs(values) <= deviations * sigma
                 self._inside[k] += (inside & told).sum(axis=0)
 
     @property
@@ -81,8 +88,8 @@ class Statistics:
     def quantile(self, share: float) -> Float[np.ndarray, " m"]:
         """Quantile of each number, right to 0.2 % of itself; NaN without trials."""
         result = np.full(len(self.mean), np.nan)
-        codes = np.array(sorted(self._bins), dtype=np.int64)
-        times = np.array([self._bins[int(code)] for code in codes])
+        self._sort()
+        codes, times = self._codes, self._times
         owner = codes // (2 * _BINS)
         for k in np.unique(owner):
             own = owner == k
@@ -91,6 +98,17 @@ class Statistics:
             result[k] = _value(int(codes[own][at]) % (2 * _BINS))
         # The ends are known exactly.
         return np.clip(result, self.least, self.largest)
+
+    def _sort(self) -> None:
+        """Count the codes that wait."""
+        codes = np.concatenate([self._codes, *self._waiting])
+        times = np.ones(len(codes), np.int64)
+        times[: len(self._times)] = self._times
+        self._codes, place = np.unique(codes, return_inverse=True)
+        # Sums of whole numbers below 2^53 are exact in float64.
+        counted = np.bincount(place, times, len(self._codes))
+        self._times = counted.astype(np.int64)
+        self._waiting = []
 
     def coverage(self, level: float) -> Float[np.ndarray, " m"]:
         """Share of trials whose error was within the interval of a level that was foretold.
