@@ -419,9 +419,9 @@ def test_the_pace_grows_while_that_pays():
     fixed = Pace(100, devices=8)
     assert fixed.batch == 104
     short = Pace(None)
-    for _ in range(4):
-        short.note(1.0, 0.9, 640)
-    assert short.batch == 64
+    short.note(1.0, 0.9, 640)
+    short.note(0.1, 0.0, 576)
+    assert short.batch == 64 and short.found
 
 
 def test_a_killed_run_loses_nothing_that_was_written(tmp_path):

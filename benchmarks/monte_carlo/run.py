@@ -270,28 +270,27 @@ def table(found: dict) -> str:
 
 def draw(found: dict, file: Path) -> None:
     """results.png."""
-    figure = Figure(figsize=(10, 3.2), layout="constrained")
-    left, middle, right = figure.subplots(1, 3)
+    figure = Figure(figsize=(11, 3), layout="constrained")
+    loops, trials, lengths, sizes = figure.subplots(1, 4)
     a, g = found["against"], found["growth"]
-    left.barh(list(a["seconds"]), list(a["seconds"].values()))
-    left.set(xscale="log", xlabel="seconds", title=f"{a['trials']:,} chains")
-    middle.loglog(
-        [r["trials"] for r in g["trials"]], [r["seconds"] for r in g["trials"]], "o-",
-        label="over trials, 6 stations",
-    )  # fmt: skip
-    twin = middle.twiny()
-    twin.loglog(
-        [r["stations"] for r in g["lengths"]], [r["seconds"] for r in g["lengths"]], "s--",
-        color="C1",
-    )  # fmt: skip
-    twin.set_xlabel("stations (dashed, 3,000 trials)")
-    middle.set(xlabel="trials", ylabel="seconds")
+    bars = loops.barh(list(a["seconds"]), list(a["seconds"].values()))
+    loops.bar_label(bars, fmt="%.2f s", padding=3)
+    loops.set(xlabel="seconds", title=f"{a['trials']:,} chains")
+    loops.set_xlim(right=1.35 * max(a["seconds"].values()))
+    for axis, rows, name, title in (
+        (trials, g["trials"], "trials", f"6 stations: n^{g['of_trials'][0]:.2f}"),
+        (lengths, g["lengths"], "stations", f"3,000 trials: n^{g['of_lengths'][0]:.2f}"),
+    ):
+        axis.loglog([row[name] for row in rows], [row["seconds"] for row in rows], "o-")
+        axis.set(xlabel=name, ylabel="seconds", title=title)
+    lengths.set_xticks(LONG, [str(n) for n in LONG])
+    lengths.minorticks_off()
     own = [row for row in found["batches"] if row["asked"] is not None]
-    right.semilogx([r["asked"] for r in own], [r["seconds"] for r in own], "o-")
+    sizes.semilogx([r["asked"] for r in own], [r["seconds"] for r in own], "o-")
     chosen = found["batches"][-1]
-    right.plot(chosen["batch"], chosen["seconds"], "*", markersize=12, color="C1")
-    right.set(xlabel="batch (star: found)", ylabel="seconds", title="10,000 poses of 20 points")
-    right.set_ylim(bottom=0.0)
+    sizes.plot(chosen["batch"], chosen["seconds"], "*", markersize=12, color="C1")
+    sizes.set(xlabel="batch (star: found)", ylabel="seconds", title="10,000 poses of 20 points")
+    sizes.set_ylim(bottom=0.0)
     figure.savefig(file, dpi=120)
 
 

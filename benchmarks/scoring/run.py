@@ -172,7 +172,12 @@ def draw(found: dict, file: Path) -> None:
         title=f"{by_size[0]['hypotheses']:,} hypotheses or so: n^{found['of_residuals'][0]:.2f}",
     )
     many = found["by_hypotheses"]
-    right.loglog([r["hypotheses"] for r in many], [r["seconds"] for r in many], "o-")
+    right.semilogx([r["hypotheses"] for r in many], [r["seconds"] for r in many], "o-")
+    right.set_ylim(0.0, 1.15 * max(r["seconds"] for r in many))
+    right.set_xticks(HYPOTHESES, [f"{n:,}" for n in HYPOTHESES])
+    right.minorticks_off()
+    left.set_yticks([0.5, 1, 2, 4, 8], ["0.5", "1", "2", "4", "8"])
+    left.tick_params(axis="y", which="minor", left=False, labelleft=False)
     right.set(
         xlabel="hypotheses",
         title=f"{found['target']['residuals']:,} residuals: n^{found['of_hypotheses'][0]:.2f}",

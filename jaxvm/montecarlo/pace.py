@@ -34,7 +34,7 @@ class Pace:
         first = min(_FIRST * devices, max(trials, 1))
         self.batch = self._whole(first if batch is None else batch)
         self._seconds: dict[int, float] = {}  # of a trial, the best of each size
-        self._before = 0
+        self._before, self._compiling = 0, 0.0
         self._memory = _peak()
 
     def note(self, seconds: float, compiling: float, left: int) -> None:
@@ -46,13 +46,14 @@ class Pace:
         self._seconds[self.batch] = min(own, self._seconds.get(self.batch, own))
         if fresh:
             # The first run of a program warms up; the second one counts.
+            self._compiling = compiling
             return
         if self._before and self._seconds[self.batch] * _GAIN > self._seconds[self._before]:
             self.batch, self.found = self._before, True
             return
         larger = self._whole(self.batch * _FACTOR)
         grown = _FACTOR * max(_peak() - self._memory, 0)
-        cheap = left * self._seconds[self.batch] > _WORTH * compiling
+        cheap = left * self._seconds[self.batch] > _WORTH * self._compiling
         if larger > _LARGEST or 2 * larger > left or not cheap or grown > 0.5 * _room():
             self.found = True
             return
