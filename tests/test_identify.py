@@ -29,6 +29,8 @@ from jaxvm.identify.trajectories import (
     _of_epochs,
     trajectories,
 )
+from jaxvm.montecarlo import run
+from jaxvm.montecarlo.drift import compensation_study
 from jaxvm.network.residual import predict_pixels, residual
 from jaxvm.network.scene import build
 from jaxvm.physics.drivers import POWER_ON
@@ -274,6 +276,24 @@ def test_compensation_of_another_day(identified):
     depth = [table["shift_z"].to_numpy() for table in poses]
     assert np.std(depth[2] - depth[0]) < 0.2 * np.std(depth[1] - depth[0])
     assert list(poses[0]["camera"].unique()) == ["left"]
+
+
+def test_a_study_of_compensation_under_noise():
+    """Models learnt from images that are noisier each time take the drift of another day off."""
+    drifts = []
+    for seed in (1, 8):
+        moved, still = a_recording(DRIFT, seed), a_recording((), seed)
+        drifts.append((moved.observations.pixel - still.observations.pixel).reshape(200, 20, 2))
+    # A model compensates to the mean state of its training.
+    drift = (drifts[1] - drifts[0].mean(axis=0)).reshape(-1, 2)
+    days = a_recording(DRIFT, 1), a_recording(DRIFT, 8)
+    study = compensation_study(*days, drift, structures=CONTINUOUS[:3])
+    found = run(study, 0, 2)
+    assert found.failed == 0 and found.names == ("mean_px[0]", "mean_px[1]", "rms_px[0]")
+    before, left = found.columns["before_px"], found.columns["error.rms_px[0]"]
+    assert (left < 0.1 * before).all() and left[0] != left[1]
+    with pytest.raises(ValueError, match="drifts do not fit"):
+        compensation_study(*days, drift[:-1])
 
 
 def test_a_model_survives_its_file(identified, tmp_path):

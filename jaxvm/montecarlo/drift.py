@@ -22,6 +22,7 @@ def compensation_study(
     drift: Float[np.ndarray, "observations 2"],
     noise: Noise | None = None,
     told: dict[str, Any] | None = None,
+    **how: Any,
 ) -> OneByOne:
     """The study of what a drift model takes off another history of temperature.
 
@@ -35,6 +36,7 @@ def compensation_study(
             compensates to: the mean state of the training.
         noise: its distribution; normal by default.
         told: what else the study is, for a file.
+        how: anything else that `identify` takes: structures, steps.
 
     Raises:
         ValueError: drifts that are not those of the observations of `other`.
@@ -47,7 +49,7 @@ def compensation_study(
 
     def trial(key) -> Trial:
         learnt, applied = jax.random.split(key)
-        model = identify(_noisy(train, learnt, noise)).model
+        model = identify(_noisy(train, learnt, noise), **how).model
         taken = -compensate(_noisy(other, applied, noise), model).correction
         left = drift - taken
         return Trial(
