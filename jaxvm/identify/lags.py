@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 
 from jaxvm.identify.gains import SLOWEST, Fit, foretold_density, gains_at, prior_widths
 from jaxvm.identify.inputs import Inputs, are_power
-from jaxvm.network.factors import rounded
+from jaxvm.physics.blocks import rounded
 from jaxvm.physics.forms import first_order_lag
 
 _LATEST = 20.0

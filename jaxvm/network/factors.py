@@ -15,17 +15,9 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from jaxvm.geometry.lenses import LensFamily
 from jaxvm.geometry.poses import Pose, pose_from_vector, se3_log
+from jaxvm.network.tiles import Tiles
 from jaxvm.physics.chain import Aim, Circumstances, Sight, predict_pixel, predict_range
 from jaxvm.physics.ports import PortValues
-
-
-def rounded(n: int) -> int:
-    """The next number of the form m * 2^k with m in 4..8: sizes of tables, at most a quarter more.
-
-    Few sizes mean few compiled programs.
-    """
-    step = 1 << max(int(n - 1).bit_length() - 3, 0)
-    return -(-n // step) * step
 
 
 class Factor(eqx.Module):
@@ -55,6 +47,10 @@ class Factor(eqx.Module):
         """The table without what the effects add to it."""
         return self
 
+    def untiled(self) -> "Factor":
+        """The table as rows alone: every leaf leads with the observations."""
+        return self
+
     @abc.abstractmethod
     def data(self) -> PyTree:
         """PyTree of the recorded values; its leaves lead with the observations."""
@@ -71,7 +67,8 @@ class PixelFactor(Factor):
     """Image points of all cameras with one family of lenses: predicted minus measured pixel.
 
     The table is padded to a round number of rows, so that recordings of similar size are the same
-    program; padding repeats the last observation with weight zero.
+    program; padding repeats the last observation with weight zero. `tiles` are its rows with the
+    same parameters but the mark; None where few have.
     """
 
     family: LensFamily = eqx.field(static=True)
@@ -82,10 +79,14 @@ class PixelFactor(Factor):
     circumstances: Circumstances
     view: Int[Array, " observations"]
     pattern: Float[Array, "observations columns"]
+    tiles: Tiles | None
 
     @property
     def n_real(self) -> int:
         return int(self.real)
+
+    def untiled(self):
+        return eqx.tree_at(lambda f: f.tiles, self, None, is_leaf=lambda leaf: leaf is None)
 
     def bare(self):
         return eqx.tree_at(lambda f: f.pattern, self, self.pattern[:, :0])

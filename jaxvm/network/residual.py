@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 
 from jaxvm.geometry.poses import Pose, TurnedPose
 from jaxvm.geometry.rotations import so3_exp, so3_left_jacobian
+from jaxvm.network.componentwise import componentwise, joined
 from jaxvm.network.factors import (
     ClosureFactor,
     EdgeFactor,
@@ -24,7 +25,8 @@ from jaxvm.network.factors import (
     RangeFactor,
 )
 from jaxvm.network.state import Layout, State
-from jaxvm.physics.blocks import by_blocks, hosted, roomy
+from jaxvm.network.tiles import Tiles
+from jaxvm.physics.blocks import by_blocks, hosted, roomy, whole
 from jaxvm.physics.effects import Channels, EffectTable, course_slopes, courses
 from jaxvm.physics.ports import N_PORTS, PortValues
 
@@ -142,12 +144,17 @@ def rows(factor: Factor, network: Network, at: Present) -> Float[Array, "observa
 def _chained(function, factor: Factor, at: Present, ports):
     """A function of a table, the flat state and the port values of each row, block by block.
 
-    It knows nothing of effects, so their number changes no program of the chain.
+    It knows nothing of effects, so their number changes no program of the chain. Where the table is
+    one program and nothing acts on it, tiles of rows are computed number by number.
     """
     n = factor.slots.shape[0]
+    shared = at.flat, at.rotation, at.lever
+    factor = factor.bare()
+    if ports is None and isinstance(factor, PixelFactor) and factor.tiles and whole(factor, shared):
+        return function(factor, shared, None)
     ports = np.zeros((n, 0)) if ports is None else ports
-    shared = tuple(map(roomy, (at.flat, at.rotation, at.lever)))
-    return by_blocks(partial(_apart, function), (factor.bare(), ports), shared)
+    table = factor.untiled(), ports
+    return by_blocks(partial(_apart, function), table, tuple(map(roomy, shared)))
 
 
 def _apart(function, table, shared):
@@ -194,24 +201,49 @@ class _Pose(NamedTuple):
 
 
 def _own(factor: Factor, shared) -> list:
-    """Values of a table's parameters, poses as rotations and shifts."""
+    """Values of a table's parameters, poses as rotations and shifts; what the rows of a tile share
+    once a tile."""
     flat, rotation, lever = shared
+    tiles = _tiles(factor)
+    *others, last = _slots_of_parts(factor)
+    if tiles is not None:
+        others = [slots[tiles.rows[:, :1]] for slots in others]
+        last = last[tiles.rows]
     found = []
-    for slots in _slots_of_parts(factor):
-        if slots.shape[1] == 6:
-            k = slots[:, 0] // 6
-            found.append(_Pose(Pose(rotation[k], flat[slots[:, 3:]]), lever[k]))
+    for slots in (*others, last):
+        if slots.shape[-1] == 6:
+            k = slots[..., 0] // 6
+            found.append(_Pose(Pose(rotation[k], flat[slots[..., 3:]]), lever[k]))
         else:
             found.append(flat[slots])
     return found
 
 
+def _tiles(factor: Factor) -> Tiles | None:
+    return factor.tiles if isinstance(factor, PixelFactor) else None
+
+
+def _by_rows(function, factor: Factor, shared, ports) -> Any:
+    """A function of a row's parameters, port values and data, over a table."""
+    own, data, tiles = _own(factor, shared), factor.data(), _tiles(factor)
+    if tiles is None:
+        return jax.vmap(function)(own, ports, data)
+    data = jax.tree.map(lambda leaf: leaf[tiles.rows], data)
+    numbers = componentwise(function, own, ports, data, axes=2)
+
+    def in_rows(own):
+        values = joined(own, tiles.rows.shape, 0)
+        return jnp.reshape(values, (tiles.rows.size, *own.shape))[tiles.place]
+
+    return jax.tree.map(in_rows, numbers)
+
+
 @eqx.filter_jit
 def _values(factor: Factor, shared, ports) -> Float[Array, "observations components"]:
-    def local(own, data, ports):
+    def local(own, ports, data):
         return factor.local(list(map(_still, own)), data, PortValues(ports))
 
-    return jax.vmap(local)(_own(factor, shared), factor.data(), ports)
+    return _by_rows(local, factor, shared, ports)
 
 
 def _still(part):
@@ -298,13 +330,12 @@ def _by_effects(table, acting: Acting, slopes, owner):
 @eqx.filter_jit
 def _derivatives(factor: Factor, shared, ports, live: tuple[int, ...]):
     """Values of the rows, and their derivatives by live slots of their own and by all ports."""
-    parts = _own(factor, shared)
     ends = np.cumsum(factor.widths)
     first = np.concatenate([[0], ends])[:-1]
     # Only parameters with a wanted slot are differentiated; the others are constants.
     moving = [k for k in range(len(ends)) if any(first[k] <= at < ends[k] for at in live)]
     within = np.concatenate([np.arange(first[k], ends[k]) for k in moving] or [[]])
-    wanted = jnp.asarray(np.searchsorted(within, np.asarray(live, int)), int)
+    wanted = np.searchsorted(within, np.asarray(live, int))
 
     def local(free, ports, parts, data):
         own = list(map(_still, parts))
@@ -314,16 +345,18 @@ def _derivatives(factor: Factor, shared, ports, live: tuple[int, ...]):
         value = factor.local(own, data, PortValues(ports))
         return value, value
 
-    n = factor.slots.shape[0]
-    free = [jnp.zeros((n, factor.widths[k])) for k in moving]
-    if not free and ports is None:
+    def row(parts, ports, data):
+        free = [jnp.zeros(factor.widths[k]) for k in moving]
+        derivative = jax.jacrev(local, argnums=(0, 1), has_aux=True)
+        (blocks, by_ports), value = derivative(free, ports, parts, data)
+        none = jnp.zeros((len(value), 0))
+        by_own = jnp.concatenate([none, *blocks], axis=1)[:, wanted]
+        return value, by_own, none if by_ports is None else by_ports
+
+    if not moving and ports is None:
         value = _values(factor, shared, None)
         return value, *(2 * (jnp.zeros((*value.shape, 0)),))
-    derivative = jax.vmap(jax.jacrev(local, argnums=(0, 1), has_aux=True))
-    (blocks, by_ports), value = derivative(free, ports, parts, factor.data())
-    none = jnp.zeros((*value.shape, 0))
-    by_own = jnp.concatenate([none, *blocks], axis=2)[:, :, wanted]
-    return value, by_own, none if by_ports is None else by_ports
+    return _by_rows(row, factor, shared, ports)
 
 
 def predict_pixels(state: State, network: Network) -> tuple[Float[Array, "observations 2"], ...]:

@@ -18,8 +18,9 @@ from jaxvm.network.factors import (
     PixelFactor,
     PriorFactor,
     RangeFactor,
-    rounded,
 )
+from jaxvm.network.tiles import Tiles
+from jaxvm.physics.blocks import rounded
 from jaxvm.physics.chain import Circumstances
 
 if TYPE_CHECKING:
@@ -129,6 +130,7 @@ class Tables:
             ]
             height = np.array([c.image_size[1] for c in self.model.cameras], float)[camera]
             sigma = np.repeat(obs.sigma[chosen][:, None], 2, axis=1)
+            *shared, _ = slots
             factors.append(
                 PixelFactor(
                     family=family,
@@ -141,6 +143,7 @@ class Tables:
                     ),
                     view=jnp.asarray(self.channels.view(camera, epoch)),
                     pattern=jnp.zeros((len(chosen), 0)),
+                    tiles=Tiles.of(np.concatenate(shared, axis=1)),
                 )
             )
         return tuple(tables), tuple(factors)

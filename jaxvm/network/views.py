@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxvm.geometry.lenses import BrownConrady, LensFamily, lens_family
-from jaxvm.network.factors import rounded
+from jaxvm.physics.blocks import rounded
 from jaxvm.recording import Recording
 
 MIN_POINTS = 4

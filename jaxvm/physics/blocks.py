@@ -60,6 +60,15 @@ def _cut(leaf: np.ndarray, start: int, size: int) -> np.ndarray:
     return leaf[np.minimum(np.arange(start, start + size), len(leaf) - 1)]
 
 
+def rounded(n: int) -> int:
+    """The next number of the form m * 2^k with m in 4..8: sizes of tables, at most a quarter more.
+
+    Few sizes mean few compiled programs.
+    """
+    step = 1 << max(int(n - 1).bit_length() - 3, 0)
+    return -(-n // step) * step
+
+
 def roomy(values, axis: int = 0, least: int = 64) -> Any:
     """An array filled up with its last value along an axis, to a power of two, `least` or more."""
     return _grown(values, axis, least, mode="edge")

@@ -16,12 +16,11 @@ from jaxtyping import Bool, Float, Int
 from scipy.stats import chi2
 
 from jaxvm.geometry import LensFamily, pose_from_vector, so3_exp
-from jaxvm.network.factors import rounded
 from jaxvm.network.residual import parts_of, predict_pixels
 from jaxvm.network.scene import Scene
 from jaxvm.network.state import N_DISTORTION
 from jaxvm.network.views import MIN_POINTS
-from jaxvm.physics.blocks import by_blocks
+from jaxvm.physics.blocks import by_blocks, rounded
 from jaxvm.pose.monocular import locate
 from jaxvm.pose.refine import Refined, refine_many
 from jaxvm.pose.sighting import Sighting, sighting

@@ -11,11 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxvm.network.factors import Factor, rounded
+from jaxvm.network.factors import Factor
 from jaxvm.network.residual import Linearised, Network, Residuals, linearise, present, residual
 from jaxvm.network.scene import Scene
 from jaxvm.network.state import Layout, State
 from jaxvm.network.unknowns import Unknowns
+from jaxvm.physics.blocks import rounded
 from jaxvm.solve.arrow import Arrow
 from jaxvm.solve.robust import Loss, SquaredLoss
 

@@ -88,7 +88,7 @@ def _cut(factor: Factor, packets: Packets, devices: int) -> tuple[Factor, Packet
         leaf = np.asarray(leaf)
         return leaf[index] if leaf.ndim else np.broadcast_to(leaf, (devices,))
 
-    table = jax.tree.map(taken, factor)
+    table = jax.tree.map(taken, factor.untiled())
     weight = np.where(rows.reshape(devices, -1) < n, table.weight, 0.0)
     table = eqx.tree_at(lambda f: f.weight, table, weight)
     local = np.broadcast_to(np.arange(own * width).reshape(own, width), (devices, own, width))

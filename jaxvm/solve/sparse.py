@@ -173,7 +173,7 @@ def _products(problem: Problem, packets_of: tuple[Packets, ...], x):
     def of_packet(rows, factor, packets: Packets):
         n = factor.slots.shape[0]
         at = jnp.minimum(rows, n - 1)
-        own = jax.tree.map(lambda leaf: leaf[at] if leaf.ndim else leaf, factor)
+        own = jax.tree.map(lambda leaf: leaf[at] if leaf.ndim else leaf, factor.untiled())
         weight = jnp.where(rows < n, own.weight, 0.0)
         raw = linearise(own, network, now, packets.live)
         (table,) = whitened(
