@@ -42,8 +42,7 @@ def one(n: int, repeats: int) -> dict:
     """Simulate, start and adjust a network of n stations in this process."""
     from jaxvm.network.scene import build
     from jaxvm.network.start import start
-    from jaxvm.scenes.describe import read_description
-    from jaxvm.scenes.make import simulate_network
+    from jaxvm.scenes import read_description, simulate_network
     from jaxvm.solve.adjust import adjust
     from jaxvm.solve.compiling import keep_compiled
 

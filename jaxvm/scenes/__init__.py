@@ -4,15 +4,11 @@
 of its own, which shares no model with the network.
 """
 
-from jaxvm.scenes.describe import (
-    Description,
-    description_text,
-    example_names,
-    parse_description,
-    read_description,
-)
+from jaxvm.scenes.describe import Description
 from jaxvm.scenes.layouts import LAYOUTS, Layout, Plan, Structure
 from jaxvm.scenes.make import simulate_network
+from jaxvm.scenes.parse import parse_description
+from jaxvm.scenes.read import description_text, example_names, read_description
 from jaxvm.scenes.truth import Simulated, Truth
 
 __all__ = [

@@ -1,0 +1,48 @@
+"""Where the TOML of a network comes from: a file, or an example of the package."""
+
+from importlib import resources
+from pathlib import Path
+
+from jaxvm.recording.errors import RecordingError
+from jaxvm.scenes.describe import Description
+from jaxvm.scenes.parse import parse_description
+
+
+def example_names() -> tuple[str, ...]:
+    """Names of the examples that come with the package."""
+    files = resources.files("jaxvm.scenes").joinpath("examples").iterdir()
+    return tuple(sorted(file.name[:-5] for file in files if file.name.endswith(".toml")))
+
+
+def read_description(scene: str | Path) -> Description:
+    """A network from its TOML file, or an example by its name.
+
+    Raises:
+        RecordingError: there is no such file or example, or something in it is wrong; names the
+            file, the line and the mend.
+    """
+    path = Path(scene)
+    name = path.name if path.is_file() else f"{scene}.toml"
+    return parse_description(description_text(scene), name)
+
+
+def description_text(scene: str | Path) -> str:
+    """The TOML of a network from its file, or of an example.
+
+    Raises:
+        RecordingError: there is no such file or example, or it is no text.
+    """
+    name, path = str(scene), Path(scene)
+    if name in example_names() and not path.is_file():
+        file = resources.files("jaxvm.scenes").joinpath("examples", f"{name}.toml")
+        return file.read_text(encoding="utf-8")
+    if not path.is_file():
+        known = ", ".join(("deformation", *example_names()))
+        raise RecordingError(
+            f"{name}: there is no such file, and no example of that name ({known}); "
+            'write one, `layout = "chain"` is enough'
+        )
+    try:
+        return path.read_text(encoding="utf-8")
+    except UnicodeDecodeError:
+        raise RecordingError(f"{path.name}: it is not a text in UTF-8; save it as one") from None
