@@ -101,8 +101,10 @@ def test_coverage_without_sigmas_is_none():
         found.coverage(0.8)
 
 
-def test_quantiles_of_nothing_are_none():
-    assert np.isnan(Statistics(2).quantile(0.5)).all()
+def test_quantiles_and_sizes_of_nothing_are_none():
+    found = Statistics(2)
+    assert np.isnan(found.quantile(0.5)).all()
+    assert np.isnan(found.rms).all() and np.isnan(found.interval()).all()
 
 
 # --- noise --------------------------------------------------------------------------------------
@@ -144,6 +146,7 @@ def test_heavy_tails_spread_gauss_newton_as_theory_says(scene):
 def test_monte_carlo_agrees_with_theory(scene):
     found = montecarlo(scene, lambda s: s.world_from_station[1:], jax.random.key(0), 1000, 250)
     assert not found.failed.any()
+    assert np.allclose(found.measured, np.sqrt(np.mean(found.errors**2, axis=0)), rtol=1e-10)
     low, high = found.interval(0.9999)
     assert (low < found.predicted).all() and (found.predicted < high).all()
     n = found.errors.size

@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
-from scipy.stats import chi2
 
 from jaxvm.montecarlo.estimators import Estimator, GaussNewton
 from jaxvm.montecarlo.noise import Noise, Normal
@@ -185,14 +184,12 @@ class MonteCarlo:
 
     @property
     def measured(self) -> Float[np.ndarray, " m"]:
-        """Root mean square errors of the trials."""
-        return np.sqrt(np.mean(self.errors**2, axis=0))
+        """Root mean square errors of the trials; NaN where none converged."""
+        return self.results.statistics.rms
 
     def interval(self, level: float = 0.95) -> Float[np.ndarray, "2 m"]:
         """Interval of the true root mean square errors (chi-square)."""
-        n = len(self.errors)
-        bounds = chi2.ppf([0.5 + 0.5 * level, 0.5 - 0.5 * level], n)
-        return self.measured * np.sqrt(n / bounds)[:, None]
+        return self.results.statistics.interval(level)
 
     @property
     def chi_square(self) -> float:

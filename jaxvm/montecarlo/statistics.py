@@ -76,8 +76,10 @@ class Statistics:
 
     @property
     def rms(self) -> Float[np.ndarray, " m"]:
-        """Root mean square: about zero."""
-        return np.sqrt(np.diagonal(self._scatter) / max(self.count, 1) + self.mean**2)
+        """Root mean square: about zero; NaN without trials."""
+        if not self.count:
+            return np.full(len(self.mean), np.nan)
+        return np.sqrt(np.diagonal(self._scatter) / self.count + self.mean**2)
 
     def interval(self, level: float = 0.95) -> Float[np.ndarray, "2 m"]:
         """Interval of the true root mean squares (chi-square, for normal errors)."""
