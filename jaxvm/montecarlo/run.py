@@ -95,12 +95,16 @@ class Results:
 
     @cached_property
     def columns(self) -> dict[str, np.ndarray]:
-        """All trials as columns, in the order of their numbers (`jaxvm.montecarlo.store`)."""
+        """All trials as columns, in the order of their numbers (`jaxvm.montecarlo.store`).
+
+        A folder may hold more than this run asked for; they do not count here either.
+        """
         parts = [columns_of(numbers, found) for numbers, found in self.parts()]
         if not parts:
             return {"trial": np.zeros(0, int), "converged": np.zeros(0, bool)}
         joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-        _, order = np.unique(joined["trial"], return_index=True)
+        numbers, order = np.unique(joined["trial"], return_index=True)
+        order = order[numbers < self.trials]
         return {name: values[order] for name, values in joined.items()}
 
     def frame(self) -> pd.DataFrame:
