@@ -24,7 +24,7 @@ from jaxvm.network.residual import Network
 from jaxvm.network.scene import Scene
 from jaxvm.network.state import State
 from jaxvm.solve.adjust import degrees_of_freedom
-from jaxvm.solve.arrow import factorise
+from jaxvm.solve.arrow import Arrow, factorise
 from jaxvm.solve.gauge import check_gauge
 from jaxvm.solve.large import is_large
 from jaxvm.solve.problem import Problem, normal_at, scaled, scene_problem
@@ -76,6 +76,18 @@ class NetworkTrial(eqx.Module):
         return Trial(error, found.converged, self.sigma, noted)
 
 
+class NetworkStudy(Traced):
+    """A study of a scene, and what theory foretells of it.
+
+    Attributes:
+        covariance: of the quantity, from the Gauss-Newton matrix at the scene's state.
+        degrees_of_freedom: observations minus unknowns.
+    """
+
+    covariance: Float[np.ndarray, "m m"] = eqx.field(kw_only=True)
+    degrees_of_freedom: int = eqx.field(kw_only=True)
+
+
 def named(quantity: Any) -> dict[str, Float[Array, " m"]]:
     """A quantity as named flat arrays, in the order of their names; `error` if it has none."""
     parts = quantity if isinstance(quantity, Mapping) else {"error": quantity}
@@ -92,7 +104,7 @@ def network_study(
     world: Scene | None = None,
     loss: Loss | None = None,
     told: dict[str, Any] | None = None,
-) -> Traced:
+) -> NetworkStudy:
     """The study of a scene whose measurements are drawn anew.
 
     Args:
@@ -121,13 +133,19 @@ def network_study(
     check_gauge(normal, scene.unknowns)
     estimator = GaussNewton() if estimator is None else estimator
     noise = Normal() if noise is None else noise
-    foretold = np.sqrt(np.diagonal(np.asarray(_covariance(problem, quantity))))
+    covariance = np.asarray(_covariance(problem, normal.hessian, quantity))
     like = jax.eval_shape(lambda: named(quantity(problem.state(jnp.zeros(problem.n)))))
     ends = np.cumsum([part.size for part in like.values()])[:-1]
-    sigma = dict(zip(like, map(jnp.asarray, np.split(foretold, ends)), strict=True))
+    foretold = np.split(np.sqrt(np.diagonal(covariance)), ends)
+    sigma = dict(zip(like, map(jnp.asarray, foretold), strict=True))
     source = None if world is None else (world.network, world.state)
     trial = NetworkTrial(problem, quantity, estimator, noise, truth, source, sigma)
-    return Traced(trial, {"kind": "network", "numbers": fingerprint(trial), **(told or {})})
+    return NetworkStudy(
+        trial,
+        {"kind": "network", "numbers": fingerprint(trial), **(told or {})},
+        covariance=covariance,
+        degrees_of_freedom=degrees_of_freedom(problem, normal.hessian.diagonal()),
+    )
 
 
 class Spread(eqx.Module):
@@ -226,15 +244,12 @@ def montecarlo(
     """
     study = network_study(scene, quantity, **drawing)
     found = run(study, key, trials, folder=folder, batch=batch, progress=progress)
-    assert isinstance(study.trial, NetworkTrial)
-    problem = study.trial.problem
-    normal = normal_at(problem, jnp.zeros(problem.n))
     columns = found.columns
     return MonteCarlo(
         errors=found.errors,
-        covariance=np.asarray(_covariance(problem, quantity)),
+        covariance=study.covariance,
         cost=columns["cost"][columns["converged"]],
-        degrees_of_freedom=degrees_of_freedom(problem, normal.hessian.diagonal()),
+        degrees_of_freedom=study.degrees_of_freedom,
         failed=~columns["converged"],
         results=found,
     )
@@ -291,11 +306,9 @@ class Stations(eqx.Module):
 
 
 @eqx.filter_jit
-def _covariance(problem: Problem, quantity: Quantity):
-    x = jnp.zeros(problem.n)
-
+def _covariance(problem: Problem, hessian: Arrow, quantity: Quantity):
     def flat(y):
         return jnp.concatenate(list(named(quantity(problem.state(y))).values()))
 
-    rows = jax.jacrev(flat)(x)
-    return rows @ factorise(problem.normal(x).hessian).solve(rows.T)
+    rows = jax.jacrev(flat)(jnp.zeros(problem.n))
+    return rows @ factorise(hessian).solve(rows.T)
