@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxvm.identify import compensate, identify
-from jaxvm.montecarlo.noise import Noise, Normal
 from jaxvm.montecarlo.trials import OneByOne, Trial
+from jaxvm.network.draw import Noise
 from jaxvm.recording import Recording
 
 
@@ -20,7 +20,7 @@ def compensation_study(
     train: Recording,
     other: Recording,
     drift: Float[np.ndarray, "observations 2"],
-    noise: Noise | None = None,
+    noise: Noise = jax.random.normal,
     told: dict[str, Any] | None = None,
     **how: Any,
 ) -> OneByOne:
@@ -41,7 +41,6 @@ def compensation_study(
     Raises:
         ValueError: drifts that are not those of the observations of `other`.
     """
-    noise = Normal() if noise is None else noise
     if np.shape(drift) != np.shape(other.observations.pixel):
         raise ValueError(
             f"{np.shape(drift)} drifts do not fit {np.shape(other.observations.pixel)}"

@@ -16,10 +16,9 @@ import pandas as pd
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from jaxvm.montecarlo.estimators import Estimator, GaussNewton
-from jaxvm.montecarlo.noise import Noise, Normal
 from jaxvm.montecarlo.run import Progress, Results, run
 from jaxvm.montecarlo.trials import Traced, Trial, fingerprint
-from jaxvm.network.draw import drawn, with_measurements
+from jaxvm.network.draw import Noise, drawn, with_measurements
 from jaxvm.network.residual import Network
 from jaxvm.network.scene import Scene
 from jaxvm.network.state import State
@@ -99,7 +98,7 @@ def network_study(
     quantity: Quantity,
     *,
     estimator: Estimator | None = None,
-    noise: Noise | None = None,
+    noise: Noise = jax.random.normal,
     truth: Truth | None = None,
     world: Scene | None = None,
     loss: Loss | None = None,
@@ -132,7 +131,6 @@ def network_study(
     problem, normal = scaled(problem, normal_at(problem, jnp.zeros(problem.n)))
     check_gauge(normal, scene.unknowns)
     estimator = GaussNewton() if estimator is None else estimator
-    noise = Normal() if noise is None else noise
     covariance = np.asarray(_covariance(problem, normal.hessian, quantity))
     like = jax.eval_shape(lambda: named(quantity(problem.state(jnp.zeros(problem.n)))))
     ends = np.cumsum([part.size for part in like.values()])[:-1]

@@ -1,8 +1,10 @@
-"""Distributions of noise, all with zero mean and unit variance.
+"""Distributions of noise beside the normal one, all with zero mean and unit variance.
 
-Anything that is called with a key and a shape is one; measurements multiply it by their sigmas.
+Anything that is called with a key and a shape is one (`jaxvm.network.draw.Noise`); measurements
+multiply it by their sigmas. Normal noise is `jax.random.normal`.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -10,14 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxvm.network.draw import Noise as Noise
-
-
-class Normal(eqx.Module):
-    """What the sigmas of a recording mean."""
-
-    def __call__(self, key: PRNGKeyArray, shape: tuple[int, ...]) -> Float[Array, "..."]:
-        return jax.random.normal(key, shape)
+from jaxvm.network.draw import Noise
 
 
 class StudentT(eqx.Module):
@@ -57,8 +52,8 @@ class Outliers(eqx.Module):
         return size * jax.random.normal(values, shape) / jnp.sqrt(variance)
 
 
-KINDS = {
-    "normal": Normal,
+KINDS: dict[str, Callable[..., Any]] = {
+    "normal": lambda: jax.random.normal,
     "student-t": StudentT,
     "laplace": Laplace,
     "uniform": Uniform,

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 
-from jaxvm.montecarlo.noise import Noise, Normal
 from jaxvm.montecarlo.trials import Traced, Trial, fingerprint
+from jaxvm.network.draw import Noise
 from jaxvm.pose.precision import Setup, pose_error, predicted_covariance
 
 
@@ -25,7 +25,6 @@ class PoseTrial(eqx.Module):
     noise: Noise
 
     def __call__(self, key: PRNGKeyArray) -> Trial:
-
         if isinstance(self.setup, Setup):
             setup = self.setup
         else:
@@ -41,7 +40,7 @@ class PoseTrial(eqx.Module):
 
 def pose_study(
     setup: Setup | Callable[[PRNGKeyArray], Setup],
-    noise: Noise | None = None,
+    noise: Noise = jax.random.normal,
     told: dict[str, Any] | None = None,
 ) -> Traced:
     """The study of one pose, from its global start to the maximum of the likelihood.
@@ -54,5 +53,5 @@ def pose_study(
         noise: its distribution; normal by default.
         told: what else the study is, for a file.
     """
-    trial = PoseTrial(setup, Normal() if noise is None else noise)
+    trial = PoseTrial(setup, noise)
     return Traced(trial, {"kind": "pose", "numbers": fingerprint(trial), **(told or {})})

@@ -9,8 +9,8 @@ from jaxtyping import Float
 
 from jaxvm.discover.hypotheses import Family
 from jaxvm.discover.score import ScoreTests
-from jaxvm.montecarlo.noise import Noise, Normal
 from jaxvm.montecarlo.trials import Trial
+from jaxvm.network.draw import Noise
 from jaxvm.solve.adjust import Adjustment
 
 
@@ -68,7 +68,7 @@ def score_study(
     fit: Adjustment,
     families: tuple[Family, ...],
     hidden: Float[np.ndarray, "observations components"] | None = None,
-    noise: Noise | None = None,
+    noise: Noise = jax.random.normal,
     told: dict[str, Any] | None = None,
 ) -> ScoreStudy:
     """The study of the scores of hypotheses at a fit.
@@ -90,4 +90,4 @@ def score_study(
         raise ValueError(f"a hidden change of shape {np.shape(hidden)} does not fit {shape}")
     numbers = 0.0 if hidden is None else float(np.sum(np.asarray(hidden) ** 2))
     about = {"kind": "score", "hypotheses": len(families), "hidden": numbers, **(told or {})}
-    return ScoreStudy(tests, hidden, Normal() if noise is None else noise, about)
+    return ScoreStudy(tests, hidden, noise, about)
