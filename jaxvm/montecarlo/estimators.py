@@ -13,7 +13,7 @@ from jaxvm.solve.arrow import factorise
 from jaxvm.solve.descent import Stop
 from jaxvm.solve.optimise import levenberg_marquardt
 from jaxvm.solve.problem import Problem
-from jaxvm.solve.spgd import spgd_solver
+from jaxvm.solve.spgd import descended
 
 
 class Estimate(NamedTuple):
@@ -92,15 +92,8 @@ class Spgd(eqx.Module):
     rtol: Any = eqx.field(default=1e-4, converter=jnp.asarray)
 
     def __call__(self, problem: Problem, key: PRNGKeyArray) -> Estimate:
-        solver = spgd_solver(problem, key, max_evaluations=self.max_evaluations, rtol=self.rtol)
-        bare = eqx.tree_at(lambda p: p.packets, problem, ())
-        found = optx.minimise(
-            lambda x, own: own.cost(x), solver, jnp.zeros(problem.n), bare,
-            max_steps=None, throw=False,
-        )  # fmt: skip
-        x = jnp.where(problem.active, found.value, 0.0)
-        good = found.stats["stop"] != int(Stop.FAILED)
-        return Estimate(x, found.stats["cost"], good, found.stats["evaluations"])
+        x, found = descended(problem, key, max_evaluations=self.max_evaluations, rtol=self.rtol)
+        return Estimate(x, found["cost"], found["stop"] != Stop.FAILED, found["evaluations"])
 
 
 ESTIMATORS = {

@@ -396,7 +396,7 @@ def minimise_spgd(
     if not 0.0 <= momentum < 1.0:
         raise ValueError(f"a momentum of {momentum} never comes to rest (take 0 to below 1)")
     none = -jnp.inf
-    solver = spgd_solver(
+    x, stats = descended(
         problem,
         key,
         gain=TraceGain() if gain is None else gain,
@@ -406,12 +406,8 @@ def minimise_spgd(
         max_evaluations=max_evaluations,
         rtol=rtol,
     )
-    # The packets are for normal equations; without them fewer problems differ in shape.
-    bare = eqx.tree_at(lambda p: p.packets, problem, ())
-    found = optx.minimise(_cost, solver, jnp.zeros(problem.n), bare, max_steps=None, throw=False)
-    stats = found.stats
     return descent(
-        x=jnp.where(problem.active, found.value, 0.0),
+        x=x,
         cost=stats["cost"],
         history=stats["history"],
         evaluations=stats["evaluations"],
@@ -420,10 +416,19 @@ def minimise_spgd(
     )
 
 
-def spgd_solver(problem: Problem, key: PRNGKeyArray, **rules: Any) -> SPGD:
-    """The solver for a scaled problem: `rules` are attributes of `SPGD`."""
+def descended(
+    problem: Problem, key: PRNGKeyArray, **rules: Any
+) -> tuple[Float[Array, " n"], dict[str, Any]]:
+    """Unknowns that a scaled problem comes to from x = 0, and the solver's statistics; traced.
+
+    `rules` are attributes of `SPGD`.
+    """
     n = jnp.sum(problem.active)
-    return SPGD(key=key, trace=n.astype(float), patience=10 * n, **rules)
+    solver = SPGD(key=key, trace=n.astype(float), patience=10 * n, **rules)
+    # The packets are for normal equations; without them fewer problems differ in shape.
+    bare = eqx.tree_at(lambda p: p.packets, problem, ())
+    found = optx.minimise(_cost, solver, jnp.zeros(problem.n), bare, max_steps=None, throw=False)
+    return jnp.where(problem.active, found.value, 0.0), found.stats
 
 
 def _cost(x: Float[Array, " n"], problem: Problem) -> Float[Array, ""]:
