@@ -10,8 +10,8 @@ from jaxvm.montecarlo.networks import montecarlo as montecarlo
 from jaxvm.montecarlo.networks import network_study as network_study
 from jaxvm.montecarlo.networks import station_trials as station_trials
 from jaxvm.montecarlo.poses import pose_study as pose_study
+from jaxvm.montecarlo.results import Results as Results
 from jaxvm.montecarlo.run import Progress as Progress
-from jaxvm.montecarlo.run import Results as Results
 from jaxvm.montecarlo.run import run as run
 from jaxvm.montecarlo.statistics import Statistics as Statistics
 from jaxvm.montecarlo.trials import OneByOne as OneByOne

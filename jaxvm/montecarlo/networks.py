@@ -16,7 +16,8 @@ import pandas as pd
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from jaxvm.montecarlo.estimators import Estimator, GaussNewton
-from jaxvm.montecarlo.run import Progress, Results, run
+from jaxvm.montecarlo.results import Results
+from jaxvm.montecarlo.run import Progress, run
 from jaxvm.montecarlo.trials import Traced, Trial, fingerprint
 from jaxvm.network.draw import Noise, drawn, with_measurements
 from jaxvm.network.residual import Network
