@@ -20,6 +20,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from scipy.stats import linregress, t
 
 HERE = Path(__file__).parent
 SIZES = (100, 200, 500, 1000, 2000, 5000, 10000)
@@ -80,16 +81,12 @@ def one(n: int, repeats: int) -> dict:
 
 def exponent(rows: list[dict], least: int) -> tuple[float, float]:
     """Slope of log time over log points, and half its 95 % interval, from `least` stations on."""
-    from scipy.stats import t
-
     kept = [row for row in rows if row["stations"] >= least]
     x, y = (np.log([row[key] for row in kept]) for key in ("points", "adjust_s"))
     if len(kept) < 3:
         return float("nan"), float("nan")
-    slope, offset = np.polyfit(x, y, 1)
-    left = np.sum((y - slope * x - offset) ** 2) / (len(x) - 2)
-    spread = np.sqrt(left / np.sum((x - x.mean()) ** 2))
-    return float(slope), float(t.ppf(0.975, len(x) - 2) * spread)
+    fit = linregress(x, y)
+    return float(fit.slope), float(t.ppf(0.975, len(x) - 2) * fit.stderr)
 
 
 def table(rows: list[dict]) -> str:

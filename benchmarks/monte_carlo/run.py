@@ -15,6 +15,7 @@ import json
 import os
 import resource
 import subprocess
+import sys
 import tempfile
 import time
 from pathlib import Path
@@ -31,6 +32,9 @@ from jaxvm.network.draw import drawn
 from jaxvm.network.scene import Scene, build
 from jaxvm.pose.precision import Setup
 from jaxvm.scenes import parse_description, simulate_network
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import results
 
 HERE = Path(__file__).parent
 TRIALS, STATIONS, SEED = 10_000, 6, 0
@@ -153,15 +157,6 @@ def against(options) -> dict:
     }
 
 
-def exponent(x, y) -> tuple[float, float]:
-    """Slope of log y over log x, and its standard deviation."""
-    x, y = np.log(x), np.log(y)
-    fit = np.polyfit(x, y, 1)
-    left = y - np.polyval(fit, x)
-    spread = np.sqrt(np.sum(left**2) / max(len(x) - 2, 1) / np.sum((x - x.mean()) ** 2))
-    return float(fit[0]), float(spread)
-
-
 def growth() -> dict:
     """Time over trials and over the length of the chain, warm."""
     study = network_study(chain(STATIONS), poses)
@@ -178,8 +173,8 @@ def growth() -> dict:
     return {
         "trials": trials,
         "lengths": lengths,
-        "of_trials": exponent(MANY, [row["seconds"] for row in trials]),
-        "of_lengths": exponent(LONG, [row["seconds"] for row in lengths]),
+        "of_trials": results.exponent(MANY, [row["seconds"] for row in trials]),
+        "of_lengths": results.exponent(LONG, [row["seconds"] for row in lengths]),
         "memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
     }
 
@@ -268,7 +263,7 @@ def table(found: dict) -> str:
     return "\n".join(lines) + "\n"
 
 
-def draw(found: dict, file: Path) -> None:
+def draw(found: dict) -> Figure:
     """results.png."""
     figure = Figure(figsize=(11, 3), layout="constrained")
     loops, trials, lengths, sizes = figure.subplots(1, 4)
@@ -291,7 +286,7 @@ def draw(found: dict, file: Path) -> None:
     sizes.plot(chosen["batch"], chosen["seconds"], "*", markersize=12, color="C1")
     sizes.set(xlabel="batch (star: found)", ylabel="seconds", title="10,000 poses of 20 points")
     sizes.set_ylim(bottom=0.0)
-    figure.savefig(file, dpi=120)
+    return figure
 
 
 def main() -> None:
@@ -306,10 +301,7 @@ def main() -> None:
         "growth": growth(),
         "batches": batches(),
     }
-    (HERE / "results.json").write_text(json.dumps(found, indent=1) + "\n")
-    (HERE / "results.md").write_text(table(found))
-    draw(found, HERE / "results.png")
-    print(table(found))
+    results.write(HERE, found, table(found), draw(found))
 
 
 if __name__ == "__main__":

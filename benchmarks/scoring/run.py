@@ -22,6 +22,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import results
 
 HERE = Path(__file__).parent
 EPOCHS = (24, 48, 97, 240, 480)
@@ -116,14 +120,6 @@ def apart(epochs: int, wanted: list[int]) -> dict:
     return json.loads(said.splitlines()[-1])
 
 
-def exponent(x: list[float], y: list[float]) -> tuple[float, float]:
-    """Slope of log y over log x, and its standard deviation."""
-    fit, covariance = np.polyfit(np.log(x), np.log(y), 1, cov="unscaled")
-    left = np.log(y) - np.polyval(fit, np.log(x))
-    variance = np.sum(left**2) / max(len(x) - 2, 1)
-    return float(fit[0]), float(np.sqrt(covariance[0, 0] * variance))
-
-
 def plain(size: dict) -> list[dict]:
     return [row for row in size["rows"] if not row["flips"]]
 
@@ -158,10 +154,8 @@ def table(found: dict) -> str:
     return "\n".join(lines) + "\n"
 
 
-def draw(found: dict, file: Path) -> None:
+def draw(found: dict) -> Figure:
     """results.png."""
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(8, 3.2), layout="constrained")
     left, right = figure.subplots(1, 2)
     by_size = found["by_residuals"]
@@ -182,7 +176,7 @@ def draw(found: dict, file: Path) -> None:
         xlabel="hypotheses",
         title=f"{found['target']['residuals']:,} residuals: n^{found['of_hypotheses'][0]:.2f}",
     )
-    figure.savefig(file, dpi=120)
+    return figure
 
 
 def main() -> None:
@@ -223,10 +217,10 @@ def main() -> None:
         },
         "by_residuals": by_residuals,
         "by_hypotheses": by_hypotheses,
-        "of_residuals": exponent(
+        "of_residuals": results.exponent(
             [row["residuals"] for row in by_residuals], [row["seconds"] for row in by_residuals]
         ),
-        "of_hypotheses": exponent(
+        "of_hypotheses": results.exponent(
             [row["hypotheses"] for row in by_hypotheses],
             [row["seconds"] for row in by_hypotheses],
         ),
@@ -234,10 +228,7 @@ def main() -> None:
     if options.quick:
         print(table(found))
         return
-    (HERE / "results.json").write_text(json.dumps(found, indent=1) + "\n")
-    (HERE / "results.md").write_text(table(found))
-    draw(found, HERE / "results.png")
-    print(table(found))
+    results.write(HERE, found, table(found), draw(found))
 
 
 if __name__ == "__main__":
