@@ -1,6 +1,8 @@
-"""Monte Carlo of a diagnosis' score: how hypotheses look in noise, alone or on hidden physics."""
+"""Monte Carlo of a diagnosis' score: how hypotheses look in noise, alone or on hidden physics.
 
-from dataclasses import dataclass
+One trial has as many scores as there are hypotheses, so trials run one by one.
+"""
+
 from typing import Any
 
 import jax
@@ -9,59 +11,9 @@ from jaxtyping import Float
 
 from jaxvm.discover.hypotheses import Family
 from jaxvm.discover.score import ScoreTests
-from jaxvm.montecarlo.trials import Trial
+from jaxvm.montecarlo.trials import OneByOne, Trial
 from jaxvm.network.draw import Noise
 from jaxvm.solve.adjust import Adjustment
-
-
-@dataclass(frozen=True, eq=False)
-class ScoreStudy:
-    """Scores of all hypotheses against residuals that are drawn anew.
-
-    A trial gives the largest drop of chi-square (`drop`), its surprise in standard deviations
-    (`z`), and which hypothesis that is: `family` and `hypothesis` within it.
-
-    Attributes:
-        tests: score tests at a fit.
-        hidden: whitened change of the residuals that something hidden makes; None without.
-        noise: distribution of whitened residuals.
-        told: what it is, for a file.
-    """
-
-    tests: ScoreTests
-    hidden: Float[np.ndarray, "observations components"] | None
-    noise: Noise
-    told: dict[str, Any]
-
-    together = 4
-
-    def about(self) -> dict[str, Any]:
-        return self.told
-
-    def batch(self, key, numbers, mesh=None) -> Trial:
-        """Trials one by one: one has as many scores as there are hypotheses."""
-        del mesh
-        found = [self._one(jax.random.fold_in(key, int(number))) for number in numbers]
-        return jax.tree.map(lambda *each: np.stack(each), *found)
-
-    def _one(self, key) -> Trial:
-        arrangement = self.tests.arrangement
-        shape = (len(arrangement.drivers), arrangement.components)
-        residual = np.asarray(self.noise(key, shape))
-        if self.hidden is not None:
-            residual = residual + self.hidden
-        scores = self.tests.score(1.0, residual=residual).scores
-        z = [np.where(own.valid, own.z, -np.inf) for own in scores]
-        family = int(np.argmax([own.max(initial=-np.inf) for own in z]))
-        best = int(np.argmax(z[family]))
-        return Trial(
-            error={
-                "drop": np.array([scores[family].drop.ravel()[best]]),
-                "z": np.array([z[family].ravel()[best]]),
-            },
-            converged=np.array(np.isfinite(z[family].ravel()[best])),
-            noted={"family": np.array(family), "hypothesis": np.array(best)},
-        )
 
 
 def score_study(
@@ -70,8 +22,11 @@ def score_study(
     hidden: Float[np.ndarray, "observations components"] | None = None,
     noise: Noise = jax.random.normal,
     told: dict[str, Any] | None = None,
-) -> ScoreStudy:
-    """The study of the scores of hypotheses at a fit.
+) -> OneByOne:
+    """The study of the scores of hypotheses at a fit, against residuals that are drawn anew.
+
+    A trial gives the largest drop of chi-square (`drop`), its surprise in standard deviations
+    (`z`), and which hypothesis that is: `family` and `hypothesis` within it.
 
     Args:
         fit: of the plain model.
@@ -90,4 +45,18 @@ def score_study(
         raise ValueError(f"a hidden change of shape {np.shape(hidden)} does not fit {shape}")
     numbers = 0.0 if hidden is None else float(np.sum(np.asarray(hidden) ** 2))
     about = {"kind": "score", "hypotheses": len(families), "hidden": numbers, **(told or {})}
-    return ScoreStudy(tests, hidden, noise, about)
+
+    def trial(key) -> Trial:
+        residual = np.asarray(noise(key, shape))
+        if hidden is not None:
+            residual = residual + hidden
+        scores = tests.score(1.0, residual=residual).scores
+        z = [np.where(own.valid, own.z, -np.inf) for own in scores]
+        family = int(np.argmax([own.max(initial=-np.inf) for own in z]))
+        best = int(np.argmax(z[family]))
+        return Trial(
+            error={"drop": scores[family].drop.ravel()[best], "z": z[family].ravel()[best]},
+            noted={"family": family, "hypothesis": best},
+        )
+
+    return OneByOne(trial, about, failures=())
