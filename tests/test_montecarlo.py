@@ -378,9 +378,10 @@ def test_a_folder_of_another_study_is_refused(tmp_path, scene):
     run(study, 4, 5, folder=tmp_path / "own")
     with pytest.raises(FileExistsError, match="another study \\(key differ"):
         run(study, 5, 5, folder=tmp_path / "own")
-    other = network_study(scene, last, noise=noise_by_name("student-t:5"))
-    with pytest.raises(FileExistsError, match="another study \\(study differ"):
-        run(other, 4, 5, folder=tmp_path / "own")
+    others = [{"noise": noise_by_name(name)} for name in ("student-t:5", "laplace")]
+    for other in (*others, {"estimator": LevenbergMarquardt()}):
+        with pytest.raises(FileExistsError, match="another study \\(study differ"):
+            run(network_study(scene, last, **other), 4, 5, folder=tmp_path / "own")
     (tmp_path / "files").mkdir()
     (tmp_path / "files" / "mine.txt").write_text("mine")
     with pytest.raises(FileExistsError, match="other files"):

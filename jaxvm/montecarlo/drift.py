@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxvm.identify import compensate, identify
-from jaxvm.montecarlo.trials import OneByOne, Trial
+from jaxvm.montecarlo.trials import OneByOne, Trial, fingerprint, name_of
 from jaxvm.network.draw import Noise
 from jaxvm.recording import Recording
 
@@ -56,7 +56,9 @@ def compensation_study(
             noted={"before_px": _rms(drift)},
         )
 
-    return OneByOne(trial, {"kind": "compensation", **(told or {})}, (ValueError, ArithmeticError))
+    numbers = [own.observations.pixel for own in (train, other)], drift, noise
+    about = {"kind": "compensation", "noise": name_of(noise), "numbers": fingerprint(numbers)}
+    return OneByOne(trial, about | (told or {}), (ValueError, ArithmeticError))
 
 
 def _noisy(recording: Recording, key, noise: Noise) -> Recording:

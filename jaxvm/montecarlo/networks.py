@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from jaxvm.montecarlo.estimators import Estimator, GaussNewton
 from jaxvm.montecarlo.results import Results
 from jaxvm.montecarlo.run import Progress, run
-from jaxvm.montecarlo.trials import Traced, Trial, fingerprint
+from jaxvm.montecarlo.trials import Traced, Trial, fingerprint, name_of
 from jaxvm.network.draw import Noise, drawn, with_measurements
 from jaxvm.network.residual import Network
 from jaxvm.network.scene import Scene
@@ -139,9 +139,10 @@ def network_study(
     sigma = dict(zip(like, map(jnp.asarray, foretold), strict=True))
     source = None if world is None else (world.network, world.state)
     trial = NetworkTrial(problem, quantity, estimator, noise, truth, source, sigma)
+    about = {"kind": "network", "noise": name_of(noise), "estimator": name_of(estimator)}
     return NetworkStudy(
         trial,
-        {"kind": "network", "numbers": fingerprint(trial), **(told or {})},
+        about | {"numbers": fingerprint(trial)} | (told or {}),
         covariance=covariance,
         degrees_of_freedom=degrees_of_freedom(problem, normal.hessian.diagonal()),
     )

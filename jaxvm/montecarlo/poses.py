@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 
-from jaxvm.montecarlo.trials import Traced, Trial, fingerprint
+from jaxvm.montecarlo.trials import Traced, Trial, fingerprint, name_of
 from jaxvm.network.draw import Noise
 from jaxvm.pose.precision import Setup, pose_error, predicted_covariance
 
@@ -54,4 +54,5 @@ def pose_study(
         told: what else the study is, for a file.
     """
     trial = PoseTrial(setup, noise)
-    return Traced(trial, {"kind": "pose", "numbers": fingerprint(trial), **(told or {})})
+    about = {"kind": "pose", "noise": name_of(noise), "numbers": fingerprint(trial)}
+    return Traced(trial, about | (told or {}))

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from jaxvm.discover.hypotheses import Family
 from jaxvm.discover.score import ScoreTests
-from jaxvm.montecarlo.trials import OneByOne, Trial
+from jaxvm.montecarlo.trials import OneByOne, Trial, fingerprint, name_of
 from jaxvm.network.draw import Noise
 from jaxvm.solve.adjust import Adjustment
 
@@ -43,8 +43,9 @@ def score_study(
     shape = (len(tests.arrangement.drivers), tests.arrangement.components)
     if hidden is not None and np.shape(hidden) != shape:
         raise ValueError(f"a hidden change of shape {np.shape(hidden)} does not fit {shape}")
-    numbers = 0.0 if hidden is None else float(np.sum(np.asarray(hidden) ** 2))
-    about = {"kind": "score", "hypotheses": len(families), "hidden": numbers, **(told or {})}
+    about = {"kind": "score", "hypotheses": len(families), "noise": name_of(noise)}
+    measured = fit.scene.recording.observations.pixel
+    about |= {"numbers": fingerprint((measured, hidden, noise))} | (told or {})
 
     def trial(key) -> Trial:
         residual = np.asarray(noise(key, shape))

@@ -99,10 +99,15 @@ class Traced(eqx.Module):
         return _on_mesh(eqx.combine(arrays, rest), key, _placed(numbers, own), mesh)
 
 
-def fingerprint(trial: eqx.Module) -> str:
-    """Hash of all numbers of a trial: another scene, other sigmas or another noise is another."""
+def name_of(function: Callable) -> str:
+    """Name of a function, or of the class of anything else that is called."""
+    return getattr(function, "__qualname__", type(function).__qualname__)
+
+
+def fingerprint(tree: Any) -> str:
+    """Hash of all numbers of a trial, or of what else makes one: other sigmas are another."""
     found = hashlib.sha256()
-    for leaf in jax.tree.leaves(eqx.filter(trial, eqx.is_array)):
+    for leaf in jax.tree.leaves(eqx.filter(tree, eqx.is_array)):
         found.update(str(leaf.shape).encode() + np.ascontiguousarray(leaf).tobytes())
     return found.hexdigest()[:16]
 
