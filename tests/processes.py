@@ -20,17 +20,22 @@ def apart(*arguments, **environment) -> subprocess.Popen:
     )
 
 
-def together(*arguments) -> list[str]:
-    """Work of two processes on loopback, and what the first one says last."""
+def together(*arguments) -> list[list[str]]:
+    """Work of two processes on loopback, and what the first one says, line by line."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     both = [apart(*arguments, port, rank, 2) for rank in (0, 1)]
-    return [answer(own) for own in both][0]
+    return [answers(own) for own in both][0]
 
 
-def answer(process: subprocess.Popen, line: int = -1) -> list[str]:
+def answer(process: subprocess.Popen) -> list[str]:
     """What it said last."""
+    return answers(process)[-1]
+
+
+def answers(process: subprocess.Popen) -> list[list[str]]:
+    """What it said, line by line."""
     said = process.communicate()[0]
     assert process.returncode == 0
-    return said.splitlines()[line].split()
+    return [line.split() for line in said.splitlines()]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from networks import stereo_recording
 from pose_networks import network
-from processes import EIGHT, apart, together
+from processes import EIGHT, answers, apart, together
 
 from jaxvm.montecarlo import LevenbergMarquardt
 from jaxvm.network.scene import build
@@ -23,19 +23,19 @@ def stereo():
 
 
 def test_observations_on_eight_devices_give_the_numbers_of_one():
-    said = apart("adjust", XLA_FLAGS=EIGHT).communicate()[0].splitlines()
+    said = answers(apart("adjust", XLA_FLAGS=EIGHT))
     assert len(said) == 2
-    for line in said:
-        devices, evaluations, off = line.split()
+    for devices, evaluations, off in said:
         assert devices == "8" and int(evaluations) > 2 and float(off) < 1e-9
 
 
 def test_observations_in_two_processes_give_the_numbers_of_one():
-    devices, evaluations, off = together("adjust")
-    assert devices == "2" and int(evaluations) > 2 and float(off) < 1e-9
+    # What joins the processes may say something before.
+    for devices, evaluations, off in together("adjust")[-2:]:
+        assert devices == "2" and int(evaluations) > 2 and float(off) < 1e-9
 
 
-def test_normal_equations_do_not_depend_on_the_share(stereo):
+def test_normal_equations_of_one_device_are_those_of_the_problem(stereo):
     problem = scene_problem(stereo)
     mesh = jax.sharding.Mesh(np.array(jax.devices()[:1]), ("observations",))
     x = jnp.asarray(np.random.default_rng(0).normal(0.0, 1e-4, problem.n))
@@ -49,6 +49,10 @@ def test_a_mesh_with_other_axes_is_refused(stereo):
     mesh = jax.sharding.Mesh(np.array(jax.devices()[:1]), ("trials",))
     with pytest.raises(ValueError, match='one axis "observations"'):
         adjust(stereo, mesh=mesh)
+
+
+OTHERS = "outfeed", "infeed", "debug_print"
+"""Primitives that talk to the host, beside those that are called callbacks."""
 
 
 def primitives(jaxpr) -> set[str]:
@@ -66,15 +70,8 @@ def primitives(jaxpr) -> set[str]:
 
 
 @pytest.mark.parametrize("which", ["stereo", "links"])
-def test_a_whole_adjustment_needs_no_callback(stereo, which, monkeypatch):
+def test_a_whole_adjustment_needs_no_callback(stereo, which):
     """One program from the start to the solution: nothing comes back to the host on the way."""
-
-    def forbidden(*_, **__):
-        raise AssertionError("a callback to the host")
-
-    for place, name in ((jax, "pure_callback"), (jax.experimental, "io_callback")):
-        monkeypatch.setattr(place, name, forbidden)
-    monkeypatch.setattr(jax.debug, "callback", forbidden)
     scene = stereo if which == "stereo" else build(network().recording)
     problem = scene_problem(scene)
     problem, _ = scaled(problem, normal_at(problem, jnp.zeros(problem.n)))
@@ -85,7 +82,7 @@ def test_a_whole_adjustment_needs_no_callback(stereo, which, monkeypatch):
 
     found = primitives(jax.make_jaxpr(whole)(arrays).jaxpr)
     assert {"while", "cholesky"} <= found
-    assert not [name for name in found if "callback" in name or name in ("outfeed", "infeed")]
+    assert not [name for name in found if "callback" in name or name in OTHERS]
     with jax.transfer_guard("disallow"):
         program = jax.jit(whole).lower(arrays).compile()
         solution = program(arrays)
