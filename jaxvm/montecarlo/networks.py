@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from jaxvm.montecarlo.estimators import Estimator, GaussNewton
@@ -133,10 +134,8 @@ def network_study(
     check_gauge(normal, scene.unknowns)
     estimator = GaussNewton() if estimator is None else estimator
     covariance = np.asarray(_covariance(problem, normal.hessian, quantity))
-    like = jax.eval_shape(lambda: named(quantity(problem.state(jnp.zeros(problem.n)))))
-    ends = np.cumsum([part.size for part in like.values()])[:-1]
-    foretold = np.split(np.sqrt(np.diagonal(covariance)), ends)
-    sigma = dict(zip(like, map(jnp.asarray, foretold), strict=True))
+    _, in_parts = ravel_pytree(named(quantity(problem.state(jnp.zeros(problem.n)))))
+    sigma = in_parts(jnp.asarray(np.sqrt(np.diagonal(covariance))))
     source = None if world is None else (world.network, world.state)
     trial = NetworkTrial(problem, quantity, estimator, noise, truth, source, sigma)
     about = {"kind": "network", "noise": name_of(noise), "estimator": name_of(estimator)}
@@ -308,7 +307,7 @@ class Stations(eqx.Module):
 @eqx.filter_jit
 def _covariance(problem: Problem, hessian: Arrow, quantity: Quantity):
     def flat(y):
-        return jnp.concatenate(list(named(quantity(problem.state(y))).values()))
+        return ravel_pytree(named(quantity(problem.state(y))))[0]
 
     rows = jax.jacrev(flat)(jnp.zeros(problem.n))
     return rows @ factorise(hessian).solve(rows.T)
