@@ -1,7 +1,7 @@
 """jaxvm (JAX videometrics): measure with networks of cameras, find the physics a model left out.
 
 Double precision is switched on when the package is imported: photogrammetric normal equations
-need it. Four settings below are made unless the environment already has them:
+need it. The settings below are made unless the environment already has them:
 
 - XLA runs and waits in one pool of as many threads as there are cores (NPROC); with two cores, two
   batched triangular solves that wait for each other's helpers lock up for ever. Eight are enough.
@@ -9,15 +9,32 @@ need it. Four settings below are made unless the environment already has them:
 - XLA's own threads inside one operation bring nothing for the many small blocks here.
 - XLA's fusion emitters double the time of compiling and save a sixth of the time of running; a
   diagnosis of a recording of a new size is mostly compiling.
+- XLA drops optimization barriers before it fuses loops, and then computes a derivative again in
+  every loop that needs it: barriers stay.
+- The C library gives blocks of 32 MB and more back to the system and takes the next ones anew, page
+  by page, which costs more than what is computed in them: up to 1 GB they are kept.
 """
 
+import ctypes
 import os
+import sys
 
-for _flag in ("--xla_cpu_multi_thread_eigen", "--xla_cpu_use_fusion_emitters"):
+for _flag, _value in {
+    "--xla_cpu_multi_thread_eigen": "false",
+    "--xla_cpu_use_fusion_emitters": "false",
+    "--xla_disable_hlo_passes": "cse_barrier_expander",
+}.items():
     if _flag not in os.environ.get("XLA_FLAGS", ""):
-        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_flag}=false".strip()
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_flag}={_value}".strip()
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("NPROC", str(max(8, os.cpu_count() or 1)))
+
+_M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_THRESHOLD = -1, -2, -3  # of <malloc.h>
+if sys.platform == "linux" and not any("MALLOC" in name for name in os.environ):
+    _mallopt = getattr(ctypes.CDLL(None), "mallopt", lambda *_: 0)
+    _mallopt(_M_MMAP_THRESHOLD, 1 << 30)
+    _mallopt(_M_TRIM_THRESHOLD, (1 << 31) - 1)
+    _mallopt(_M_TOP_PAD, 1 << 26)
 
 import jax  # noqa: E402
 

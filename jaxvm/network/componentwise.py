@@ -42,8 +42,16 @@ def componentwise(function: Callable, *args, axes: int) -> Any:
         return function(*jax.tree.unflatten(structure, row))
 
     closed, result = jax.make_jaxpr(flat, return_shape=True)(*row)
-    found = _run(closed.jaxpr, closed.consts, [_apart(leaf, axes) for leaf in leaves])
-    return jax.tree.unflatten(jax.tree.structure(result), found)
+    found = _run(closed.jaxpr, closed.consts, [apart(leaf, axes) for leaf in leaves])
+    return jax.tree.unflatten(jax.tree.structure(result), settled(found))
+
+
+def settled(parts: list[Numbers]) -> list[Numbers]:
+    """The same numbers, each computed once: XLA computes a number again in every loop that it fuses
+    it into."""
+    arrays = {id(x): x for own in parts for x in own.ravel() if not is_known(x)}
+    once = dict(zip(arrays, jax.lax.optimization_barrier(list(arrays.values())), strict=True))
+    return [each(lambda x: once.get(id(x), x), own) for own in parts]
 
 
 def joined(numbers: Numbers, rows: tuple[int, ...], axis: int) -> Array:
@@ -101,13 +109,13 @@ def _applied(jaxpr, equation, inputs: list[Numbers]) -> list[Numbers]:
     if name in _MOVES:
         found = _MOVES[name](*inputs, **params)
         return list(found) if primitive.multiple_results else [found]
-    if all(_is_known(x) for own in inputs for x in own.ravel()):
+    if all(is_known(x) for own in inputs for x in own.ravel()):
         return _known(jaxpr, equation, inputs)
     if name in _RULES:
         return [_RULES[name](*inputs, **params)]
     if name in _ELEMENTWISE:
-        return [_each(functools.partial(_one, primitive, params), *inputs)]
-    if name in _INDEXED and all(map(_is_known, inputs[1].ravel())):
+        return [each(functools.partial(_one, primitive, params), *inputs)]
+    if name in _INDEXED and all(map(is_known, inputs[1].ravel())):
         return [_indexed(equation, inputs)]
     return _by_rows(jaxpr, equation, inputs)
 
@@ -130,7 +138,7 @@ def _by_rows(jaxpr, equation, inputs: list[Numbers]) -> list[Numbers]:
         function = jax.vmap(function)
     both = zip(inputs, equation.invars, strict=True)
     whole = [joined(own, rows, 0).astype(variable.aval.dtype) for own, variable in both]
-    return [_apart(part, len(rows)) for part in function(*whole)]
+    return [apart(part, len(rows)) for part in function(*whole)]
 
 
 def _alone(jaxpr, equation, values) -> list[Array]:
@@ -152,7 +160,7 @@ def _objects(array: np.ndarray) -> Numbers:
     return found
 
 
-def _apart(array, axes: int) -> Numbers:
+def apart(array, axes: int) -> Numbers:
     """An array over rows, number by number."""
     shape = np.shape(array)[axes:]
     flat = jnp.reshape(array, (*np.shape(array)[:axes], math.prod(shape)))
@@ -168,7 +176,7 @@ def _array(numbers: Numbers, variable) -> Array:
     return jnp.asarray(flat.reshape(numbers.shape))
 
 
-def _is_known(x) -> bool:
+def is_known(x) -> bool:
     return isinstance(x, np.generic)
 
 
@@ -176,8 +184,8 @@ def _is(x, value: float) -> bool:
     return isinstance(x, np.generic) and bool(x == value)
 
 
-def _each(function: Callable, *inputs: Numbers) -> Numbers:
-    """A function of single numbers, for each of them."""
+def each(function: Callable, *inputs: Numbers) -> Numbers:
+    """A function of single numbers, for each of them; shapes broadcast."""
     shape = np.broadcast_shapes(*(own.shape for own in inputs))
     inputs = tuple(np.broadcast_to(own, shape) for own in inputs)
     found = np.empty(shape, object)
@@ -200,7 +208,8 @@ def _difference(a, b):
     return a if _is(b, 0.0) else -b if _is(a, 0.0) else a - b
 
 
-def _product(a, b):
+def product(a, b):
+    """Product of two numbers."""
     for x, y in ((a, b), (b, a)):
         if _is(x, 0.0):
             return np.float64(0.0)
@@ -211,8 +220,17 @@ def _product(a, b):
     return a * b
 
 
-def _total(numbers):
+def total(numbers):
+    """Sum of numbers."""
     return functools.reduce(_sum, numbers, np.float64(0.0))
+
+
+def matmul(a: Numbers, b: Numbers) -> Numbers:
+    """Product of two matrices of numbers."""
+    found = np.empty((len(a), b.shape[1]), object)
+    for i, j in np.ndindex(*found.shape):
+        found[i, j] = total(map(product, a[i], b[:, j]))
+    return found
 
 
 # --- operations ----------------------------------------------------------------------------------
@@ -229,8 +247,8 @@ def _dot_general(a: Numbers, b: Numbers, *, dimension_numbers, **_) -> Numbers:
     left = left.reshape((*batch, math.prod(rows), -1))
     right = right.reshape((*batch, math.prod(columns), -1))
     found = np.empty((*batch, left.shape[-2], right.shape[-2]), object)
-    for *k, i, j in np.ndindex(*found.shape):
-        found[*k, i, j] = _total(map(_product, left[*k, i], right[*k, j]))
+    for k in np.ndindex(*batch):
+        found[k] = matmul(left[k], right[k].T)
     return found.reshape((*batch, *rows, *columns))
 
 
@@ -239,27 +257,27 @@ def _reduce_sum(x: Numbers, *, axes, **_) -> Numbers:
     rows = x.transpose(*kept, *axes).reshape((*(x.shape[k] for k in kept), -1))
     found = np.empty(rows.shape[:-1], object)
     for at in np.ndindex(*found.shape):
-        found[at] = _total(rows[at])
+        found[at] = total(rows[at])
     return found
 
 
 def _integer_pow(x: Numbers, *, y: int) -> Numbers:
     if not 0 <= y <= 8:
-        return _each(lambda v: v**y if _is_known(v) else jax.lax.integer_pow(v, y), x)
-    return _each(lambda v: functools.reduce(_product, [v] * y, np.float64(1.0)), x)
+        return each(lambda v: v**y if is_known(v) else jax.lax.integer_pow(v, y), x)
+    return each(lambda v: functools.reduce(product, [v] * y, np.float64(1.0)), x)
 
 
 def _select_n(which: Numbers, *cases: Numbers) -> Numbers:
     def one(which, *cases):
-        if _is_known(which):
+        if is_known(which):
             return cases[int(which)]
-        if len(cases) == 2 and all(_is_known(c) for c in cases) and cases[0] == cases[1]:
+        if len(cases) == 2 and all(is_known(c) for c in cases) and cases[0] == cases[1]:
             return cases[0]
         rows = np.broadcast_shapes(np.shape(which), *map(np.shape, cases))
         like = [jnp.broadcast_to(jnp.asarray(c), rows) for c in cases]
         return jax.lax.select_n(jnp.broadcast_to(which, rows), *like)
 
-    return _each(one, np.broadcast_to(which, cases[0].shape), *cases)
+    return each(one, np.broadcast_to(which, cases[0].shape), *cases)
 
 
 def _broadcast(x: Numbers, *, shape, broadcast_dimensions, **_) -> Numbers:
@@ -326,16 +344,16 @@ _MOVES: dict[str, Callable] = {
 }
 
 _RULES: dict[str, Callable] = {
-    "add": lambda a, b, **_: _each(_sum, a, b),
-    "add_any": lambda a, b, **_: _each(_sum, a, b),
+    "add": lambda a, b, **_: each(_sum, a, b),
+    "add_any": lambda a, b, **_: each(_sum, a, b),
     "dot_general": _dot_general,
     "integer_pow": _integer_pow,
-    "mul": lambda a, b, **_: _each(_product, a, b),
-    "neg": lambda x, **_: _each(lambda v: -v, x),
+    "mul": lambda a, b, **_: each(product, a, b),
+    "neg": lambda x, **_: each(lambda v: -v, x),
     "reduce_sum": _reduce_sum,
     "select_n": _select_n,
-    "square": lambda x, **_: _each(lambda v: _product(v, v), x),
-    "sub": lambda a, b, **_: _each(_difference, a, b),
+    "square": lambda x, **_: each(lambda v: product(v, v), x),
+    "sub": lambda a, b, **_: each(_difference, a, b),
 }
 
 _INDEXED = {"gather", "scatter"}

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from jaxvm.geometry.poses import Pose, TurnedPose
 from jaxvm.geometry.rotations import so3_exp, so3_left_jacobian
-from jaxvm.network.componentwise import componentwise, joined
+from jaxvm.network.componentwise import Numbers, componentwise, joined
 from jaxvm.network.factors import (
     ClosureFactor,
     EdgeFactor,
@@ -225,17 +225,24 @@ def _tiles(factor: Factor) -> Tiles | None:
 
 def _by_rows(function, factor: Factor, shared, ports) -> Any:
     """A function of a row's parameters, port values and data, over a table."""
-    own, data, tiles = _own(factor, shared), factor.data(), _tiles(factor)
+    tiles = _tiles(factor)
     if tiles is None:
-        return jax.vmap(function)(own, ports, data)
-    data = jax.tree.map(lambda leaf: leaf[tiles.rows], data)
-    numbers = componentwise(function, own, ports, data, axes=2)
+        return jax.vmap(function)(_own(factor, shared), ports, factor.data())
+    numbers = _by_numbers(function, factor, shared, ports)
 
     def in_rows(own):
         values = joined(own, tiles.rows.shape, 0)
         return jnp.reshape(values, (tiles.rows.size, *own.shape))[tiles.place]
 
     return jax.tree.map(in_rows, numbers)
+
+
+def _by_numbers(function, factor: Factor, shared, ports) -> Any:
+    """The same of a table in tiles, as numbers: each is an array over tiles and rows of a tile."""
+    tiles = _tiles(factor)
+    assert tiles is not None
+    data = jax.tree.map(lambda leaf: leaf[tiles.rows], factor.data())
+    return componentwise(function, _own(factor, shared), ports, data, axes=2)
 
 
 @eqx.filter_jit
@@ -330,6 +337,14 @@ def _by_effects(table, acting: Acting, slopes, owner):
 @eqx.filter_jit
 def _derivatives(factor: Factor, shared, ports, live: tuple[int, ...]):
     """Values of the rows, and their derivatives by live slots of their own and by all ports."""
+    if not live and ports is None:
+        value = _values(factor, shared, None)
+        return value, *(2 * (jnp.zeros((*value.shape, 0)),))
+    return _by_rows(_derivatives_of_row(factor, live), factor, shared, ports)
+
+
+def _derivatives_of_row(factor: Factor, live: tuple[int, ...]):
+    """Function of one row: its value, and its derivatives by live slots of its own and by ports."""
     ends = np.cumsum(factor.widths)
     first = np.concatenate([[0], ends])[:-1]
     # Only parameters with a wanted slot are differentiated; the others are constants.
@@ -353,10 +368,20 @@ def _derivatives(factor: Factor, shared, ports, live: tuple[int, ...]):
         by_own = jnp.concatenate([none, *blocks], axis=1)[:, wanted]
         return value, by_own, none if by_ports is None else by_ports
 
-    if not moving and ports is None:
-        value = _values(factor, shared, None)
-        return value, *(2 * (jnp.zeros((*value.shape, 0)),))
-    return _by_rows(row, factor, shared, ports)
+    return row
+
+
+def linearise_tiles(
+    factor: PixelFactor, at: Present, live: tuple[int, ...]
+) -> tuple[Numbers, Numbers]:
+    """Values of the rows of a table in tiles, and their derivatives by live slots of their own.
+
+    For a table on which no effect acts. Numbers of each row, [components] and [components, live];
+    each is an array over tiles and the rows of a tile, or a known number.
+    """
+    row = _derivatives_of_row(factor, live)
+    value, jacobian, _ = _by_numbers(row, factor, (at.flat, at.rotation, at.lever), None)
+    return value, jacobian
 
 
 def predict_pixels(state: State, network: Network) -> tuple[Float[Array, "observations 2"], ...]:

@@ -47,7 +47,7 @@ class Tiles(eqx.Module):
         full = [width for width in _WIDTHS if tiles(width) * width <= _MOST_FILLED * n]
         if not full:
             return None
-        width = min(full, key=lambda width: tiles(width) * (width + _TILE_COST))
+        width = min(full, key=lambda width: rounded(tiles(width)) * (width + _TILE_COST))
         pieces = -(-count // width)
         run_of = np.repeat(np.arange(len(count)), pieces)
         piece = np.arange(len(run_of)) - np.repeat(np.cumsum(pieces) - pieces, pieces)

@@ -96,8 +96,8 @@ class Products(eqx.Module):
         found, first = ([], [], []), 0
         for rows in map(np.asarray, buckets.rows):
             count, width = rows.shape
-            together = max(_MEMBERS // width, 1)
-            pieces = -(-count // together)
+            pieces = -(-count * width // _MEMBERS)
+            together = -(-count // pieces)
             spare = pieces * together - count
             rows = np.pad(rows, ((0, spare), (0, 0)), constant_values=len(owner))
             rows = rows.reshape(pieces, together, width)

@@ -254,14 +254,16 @@ def packet_products(
     values: Float[Array, "obs comps"],
 ) -> tuple[Float[Array, "packets own live"], Float[Array, "packets own"]]:
     """Products left^T right and left^T values of every packet."""
-    own, other, v = (in_packets(packets, part) for part in (left, right, values[:, :, None]))
+    own, other, v = (in_packets(packets.rows, part) for part in (left, right, values[:, :, None]))
     return jnp.einsum("prk,prl->pkl", own, other), jnp.einsum("prk,prm->pkm", own, v)[:, :, 0]
 
 
-def in_packets(packets: Packets, values: Float[Array, "obs comps k"]) -> Float[Array, "p r k"]:
+def in_packets(
+    rows: Int[Array, "packets width"], values: Float[Array, "obs comps k"]
+) -> Float[Array, "packets rows k"]:
     """Rows of a table gathered packet by packet, filled up with zeros."""
     padded = jnp.concatenate([values, jnp.zeros((1, *values.shape[1:]))])
-    gathered = padded[packets.rows]
+    gathered = padded[rows]
     p, width, components, k = gathered.shape
     return jnp.reshape(gathered, (p, width * components, k))
 

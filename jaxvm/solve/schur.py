@@ -16,8 +16,9 @@ import jax.scipy.linalg as jsl
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxvm.network.residual import linearise, present
-from jaxvm.solve.buckets import padded
+from jaxvm.network.componentwise import Numbers, apart, each, is_known, joined, matmul, total
+from jaxvm.network.residual import Linearised, linearise, linearise_tiles, present
+from jaxvm.solve.buckets import padded, taken
 from jaxvm.solve.problem import Problem, assemble, flat_state, in_packets, whitened
 from jaxvm.solve.schur_pattern import SchurPattern, View
 
@@ -47,19 +48,18 @@ class SchurNormal:
         """The same for unknowns in other units: x_new = x / scale."""
         s, groups, d = self.pattern.sizes
         a, b = jnp.asarray(scale[:s]), jnp.asarray(scale[s:].reshape(groups, d))
-        wide = self.coupling.shape[2]
-        columns = [
-            jnp.pad(own, ((0, 0), (0, wide - own.shape[1])), constant_values=s)
-            for own in (view.packets.columns for view in self.pattern.views)
+        of_group = padded(b)[self.pattern.group][:, :, None] * self.coupling
+        of_shared, wide = jnp.append(a, 1.0), self.coupling.shape[2]
+        coupling = [
+            view.in_runs(own) * of_shared[_wider(view.columns, wide, s)][:, None, None, :]
+            for view, own in self.pattern.by_table(of_group)
         ]
-        by_shared = jnp.append(a, 1.0)[jnp.concatenate(columns)][:, None, :]
-        by_local = padded(b)[self.pattern.group][:, :, None]
         return replace(
             self,
             gradient=self.gradient * scale,
             shared=a[:, None] * self.shared * a,
             local=b[:, :, None] * self.local * b[:, None, :],
-            coupling=by_local * self.coupling * by_shared,
+            coupling=jnp.concatenate([jnp.reshape(own, (-1, d, wide)) for own in coupling]),
         )
 
     def diagonal(self) -> Float[np.ndarray, " n"]:
@@ -82,61 +82,103 @@ def _linearised(problem: Problem, pattern: SchurPattern, x):
     flat, per_parameter = flat_state(problem, x)
     at = present(network, flat)
     effects = jnp.asarray(np.concatenate([layout.all("amplitude"), layout.all("constant")]))
-    cost, tables, rest = jnp.zeros(()), [], []
+    cost, products, rest = jnp.zeros(()), [], []
     for factor, view in zip(network.factors(), pattern.tables, strict=True):
-        packets = view.packets if isinstance(view, View) else view
-        raw = linearise(factor, network, at, packets.live)
-        (table,) = whitened(
-            [raw], [(factor.weight, factor.sigma)], [(factor.slots, effects, packets.live)],
-            per_parameter,
-        )  # fmt: skip
-        square = jnp.sum(table.value**2, axis=1)
+        if isinstance(view, View) and view.tiled:
+            square, value, jacobian = _of_tiles(problem, factor, view, at, per_parameter)
+        else:
+            raw = linearise(factor, network, at, view.live)
+            steps = factor.slots, effects, view.live
+            (table,) = whitened([raw], [(factor.weight, factor.sigma)], [steps], per_parameter)
+            square = jnp.sum(table.value**2, axis=1)
+            if isinstance(view, View):
+                value, jacobian = _of_packets(problem, table, view, square)
+            else:
+                rest.append((table, view, factor.slots.shape[1]))
         cost = cost + 0.5 * jnp.sum(problem.loss.value(square))
-        if not isinstance(view, View):
-            rest.append((table, packets, factor.slots.shape[1]))
-            continue
-        root = jnp.sqrt(problem.loss.weight(square))[:, None]
-        left, right = in_packets(packets, table.jacobian * root[:, :, None]), table.value * root
-        right = in_packets(packets, right[:, :, None])
-        shared, local = view.split(left)
-        # Sums over few rows: products of components, which vectorise over the packets.
-        tables.append(
-            (
-                view,
-                shared,
-                jnp.sum(local[:, :, :, None] * shared[:, :, None, :], axis=1),
-                jnp.sum(local[:, :, :, None] * local[:, :, None, :], axis=1),
-                jnp.sum(shared * right, axis=1),
-                jnp.sum(local * right, axis=1),
-            )
-        )
+        if isinstance(view, View):
+            products.append((view, *_products(view, value, jacobian)))
     s = problem.sizes[0]
     found = [t for t, *_ in rest], tuple(p for _, p, _ in rest), [n for *_, n in rest]
-    return cost, *_joined(pattern, tables, assemble(*found, problem.loss, (s, 0, 0)))
+    return cost, *_joined(pattern, products, assemble(*found, problem.loss, (s, 0, 0)))
 
 
-def _joined(pattern: SchurPattern, tables, rest):
+def _of_tiles(problem: Problem, factor, view: View, at, per_parameter):
+    """Sum of squares of each packet, and numbers of its whitened rows and derivatives by unknowns,
+    with the weights of the robust loss."""
+    rows = factor.tiles.rows
+    value, jacobian = linearise_tiles(factor, at, view.live)
+    weight = factor.weight[rows] * view.own
+    scale = apart(weight[..., None] / factor.sigma[rows], 2)
+    a, b = view.local
+    step = apart(per_parameter[view.slots], 2)
+    step[a:b] = apart(per_parameter[view.local_slots], 2)
+
+    def used(number):
+        # What is set aside counts nothing, even where it can't be predicted at all.
+        return jnp.where(weight > 0.0, number, 0.0)
+
+    value = each(lambda v, f: f * used(v), value, scale)
+    square = total(v * v for v in value)
+    root = jnp.sqrt(problem.loss.weight(square))
+
+    def derivative(j, f, t):
+        return j if is_known(j) and j == 0.0 else used(j) * (f * root) * t
+
+    jacobian = each(derivative, jacobian, scale[:, None], step)
+    return square, each(lambda v: v * root, value), jacobian
+
+
+def _of_packets(problem: Problem, table: Linearised, view: View, square):
+    """Numbers of the whitened rows and derivatives of each packet, with the weights of the loss."""
+    root = jnp.sqrt(problem.loss.weight(square))[:, None]
+    both = jnp.concatenate([table.jacobian, table.value[:, :, None]], axis=2) * root[:, :, None]
+    numbers = apart(in_packets(view.rows, both)[:, None], 2)
+    return numbers[:, -1], numbers[:, :-1]
+
+
+def _products(view: View, value: Numbers, jacobian: Numbers):
+    """Products of derivatives and rows: those of each run by shared unknowns, with the rows as one
+    more; couplings of each packet; those of each packet by local unknowns, in a line."""
+    shared, local = view.split(jacobian)
+    d = local.shape[1]
+    runs = view.own.shape
+    coupling = joined(matmul(local.T, shared), runs, 0)
+    square, pull = matmul(local.T, local), matmul(local.T, value[:, None])
+    own = joined(np.append(square[np.tril_indices(d)], pull), runs, 0)
+    side = jnp.moveaxis(joined(np.column_stack([shared, value]).T, runs, 2), 2, 0)
+    block = jnp.einsum("tarw,tbrw->tab", side, side)
+    return block, *(jnp.reshape(part, (-1, *part.shape[2:])) for part in (coupling, own))
+
+
+def _joined(pattern: SchurPattern, products, rest):
     """Sums over views and groups."""
-    s = pattern.sizes[0]
-    wide = pattern.pair_rows.shape[1]
+    s, _, d = pattern.sizes
+    wide = pattern.wide
     shared = jnp.zeros((s + 1, s + 1)).at[:s, :s].add(rest.hessian.shared)
     gradient = jnp.zeros(s + 1).at[:s].add(rest.gradient)
-    couplings, locals_, pulls = [], [], []
-    for view, own, coupling, local, by_shared, by_local in tables:
-        at = view.square_columns
-        shared = shared.at[at[:, :, None], at[:, None, :]].add(view.squares(own))
-        gradient = gradient.at[view.columns].add(view.views.sums(by_shared))
-        couplings.append(jnp.pad(coupling, ((0, 0), (0, 0), (0, wide - coupling.shape[2]))))
-        locals_.append(local)
-        pulls.append(by_local)
-    local = pattern.groups.sums(jnp.concatenate(locals_))
-    pull = pattern.groups.sums(jnp.concatenate(pulls))
+    for view, block, *_ in products:
+        at, whole = view.view_columns, view.views.sums(block)
+        shared = shared.at[at[:, :, None], at[:, None, :]].add(whole[:, :-1, :-1])
+        gradient = gradient.at[at].add(whole[:, :-1, -1])
+    couplings = [
+        jnp.pad(own, ((0, 0), (0, 0), (0, wide - own.shape[2]))) for _, _, own, _ in products
+    ]
+    own = pattern.groups.sums(jnp.concatenate([own for *_, own in products]))
+    place = np.zeros((d, d), int)
+    place[np.tril_indices(d)] = np.arange(d * (d + 1) // 2)
+    local = own[:, np.maximum(place, place.T)]
     return (
-        jnp.concatenate([gradient[:s], jnp.ravel(pull)]),
+        jnp.concatenate([gradient[:s], jnp.ravel(own[:, -d:])]),
         shared[:s, :s],
         local,
         jnp.concatenate(couplings),
     )
+
+
+def _wider(columns, wide: int, none: int):
+    """Columns of a run filled up with none."""
+    return jnp.pad(columns, ((0, 0), (0, wide - columns.shape[1])), constant_values=none)
 
 
 class SchurFactors:
@@ -217,14 +259,12 @@ def _along(vector, values):
 def _reduced(shared, half, pattern: SchurPattern, damping):
     """Cholesky factor of the reduced matrix, scaled to a unit diagonal, and whether it is sound."""
     s = shared.shape[0]
-    products = pattern.pairs(half)
-    rows, columns = pattern.pair_rows[:, :, None], pattern.pair_columns[:, None, :]
-    taken = jnp.zeros((s + 1, s + 1)).at[rows, columns].add(
-        products * pattern.halved[:, None, None]
-    )[:s, :s]  # fmt: skip
+    products = jnp.ravel(pattern.pairs(half) * pattern.halved[:, None, None])
+    off = taken(jnp.append(products, 0.0), pattern.entry)
+    off = off.at[pattern.place].add(taken(products, pattern.further)).reshape(s, s)
     diagonal = jnp.diagonal(shared)
     raised = shared + jnp.diag(jnp.where(diagonal > 0.0, damping * diagonal, 1.0))
-    matrix = raised - taken - taken.T
+    matrix = raised - off - off.T
     scale = 1.0 / jnp.sqrt(jnp.diagonal(matrix))
     factor = jnp.linalg.cholesky(scale[:, None] * matrix * scale)
     return (factor, scale), jnp.all(jnp.isfinite(factor))
@@ -238,14 +278,18 @@ def _solved(pattern: SchurPattern, lower, half, reduced, right):
     taken = jnp.sum(half * padded(forward)[pattern.group][:, :, None], axis=1)
     top = jnp.append(a, 0.0)
     for view, own in pattern.by_table(taken):
-        top = top.at[view.columns].add(-view.views.sums(own[:, : view.columns.shape[1]]))
+        of_runs = jnp.sum(view.in_runs(own), axis=1)[:, : view.n_shared]
+        top = top.at[view.view_columns].add(-view.views.sums(of_runs))
     factor, scale = reduced
     shared = scale * jsl.cho_solve((factor, True), scale * top[:s])
     seen = jnp.append(shared, 0.0)
     back = [
-        jnp.sum(own[:, :, : view.columns.shape[1]] * seen[view.packets.columns][:, None, :], axis=2)
+        jnp.sum(
+            view.in_runs(own)[..., : view.n_shared] * seen[view.columns][:, None, None, :], axis=3
+        )
         for view, own in pattern.by_table(half)
     ]
-    rest = forward - pattern.groups.sums(jnp.concatenate(back))
+    back = jnp.concatenate([jnp.reshape(own, (-1, d)) for own in back])
+    rest = forward - pattern.groups.sums(back)
     local = jnp.stack(_backward(lower, [rest[:, k] for k in range(d)]), axis=1)
     return jnp.concatenate([shared, jnp.ravel(local)])

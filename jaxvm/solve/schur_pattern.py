@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxvm.network.componentwise import Numbers, total
+from jaxvm.network.factors import Factor, PixelFactor
 from jaxvm.solve.buckets import Buckets, Products, in_order
 from jaxvm.solve.problem import Packets, Problem
 
@@ -17,30 +19,51 @@ from jaxvm.solve.problem import Packets, Problem
 class View(eqx.Module):
     """A table of observations, its packets sorted into views.
 
+    Packets stand in runs with the same shared unknowns: in tiles of the table, or one by one.
+
     Attributes:
-        packets: rows of each packet; `live` are its own shared positions, the local ones, effects.
-        views: packets of each view, that is of each combination of shared unknowns.
-        squares: of the packets of each view, in `square_columns`.
-        columns: shared unknowns of each view; their number where there is none.
+        rows: observations of each packet.
+        own: 1 for packets, 0 for what fills up runs.
+        columns: shared unknowns of each run; their number where there is none.
+        views: runs of each view, that is of each combination of shared unknowns.
+        view_columns: shared unknowns of each view.
+        live: positions with derivatives: its own shared ones, the local ones, effects.
         local: which of the live positions are local: from and to.
         tied: shared positions that are one unknown in all views, together.
+        slots, local_slots: of tiles of the table, those with derivatives (local ones of each row).
+        tiled: whether runs are the table's tiles.
     """
 
-    packets: Packets
+    rows: Int[Array, "packets width"]
+    own: Float[Array, "runs length"]
+    columns: Int[Array, "runs shared"]
     views: Buckets
-    squares: Products
-    square_columns: Int[Array, "products shared"]
-    columns: Int[Array, "views shared"]
+    view_columns: Int[Array, "views shared"]
+    slots: Int[Array, "runs 1 live"]
+    local_slots: Int[Array, "runs length d"]
+    live: tuple[int, ...] = eqx.field(static=True)
     local: tuple[int, int] = eqx.field(static=True)
     tied: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+    tiled: bool = eqx.field(static=True)
 
-    def split(self, values: Float[Array, "... live"]) -> tuple[Array, Array]:
-        """Shared and local columns."""
+    @property
+    def n_shared(self) -> int:
+        """Shared unknowns of a packet."""
+        return self.columns.shape[1]
+
+    def split(self, values: Numbers) -> tuple[Numbers, Numbers]:
+        """Shared and local columns of derivatives, [rows, live]."""
         a, b = self.local
-        shared = jnp.concatenate([values[..., :a], values[..., b:]], axis=-1)
-        if len(self.tied) < shared.shape[-1]:
-            shared = jnp.stack([sum(shared[..., k] for k in own) for own in self.tied], axis=-1)
-        return shared, values[..., a:b]
+        shared = np.concatenate([values[:, :a], values[:, b:]], axis=1)
+        columns = np.empty((len(shared), len(self.tied)), object)
+        for k, together in enumerate(self.tied):
+            for row, own in enumerate(shared[:, list(together)]):
+                columns[row, k] = total(own)
+        return columns, values[:, a:b]
+
+    def in_runs(self, values: Float[Array, "packets ..."]) -> Float[Array, "runs length ..."]:
+        """Values of packets, run by run."""
+        return jnp.reshape(values, (*self.own.shape, *values.shape[1:]))
 
 
 class SchurPattern(eqx.Module):
@@ -53,8 +76,10 @@ class SchurPattern(eqx.Module):
         groups: packets of each group.
         group: of each packet; the number of groups where it fills up.
         pairs: packets of one group by the pair of views that they fall on.
-        pair_rows, pair_columns: shared unknowns of both views of each pair.
         halved: factor on each pair: 1/2 for a view with itself, because pairs count both ways.
+        entry: of all products of pairs, the one that each entry of the reduced matrix takes; their
+            number where there is none.
+        further, place: products that are added to an entry that has one, and the entry.
         sizes: shared unknowns, groups, unknowns of a group.
     """
 
@@ -62,9 +87,11 @@ class SchurPattern(eqx.Module):
     groups: Buckets
     group: Int[Array, " packets"]
     pairs: Products
-    pair_rows: Int[Array, "pairs shared"]
-    pair_columns: Int[Array, "pairs shared"]
     halved: Float[Array, " pairs"]
+    entry: Int[Array, " entries"]
+    further: Int[Array, " more"]
+    place: Int[Array, " more"]
+    wide: int = eqx.field(static=True)
     sizes: tuple[int, int, int] = eqx.field(static=True)
 
     @property
@@ -82,7 +109,7 @@ class SchurPattern(eqx.Module):
         """Tables with local unknowns, each with the values of its own packets."""
         found, first = [], 0
         for view in self.views:
-            n = len(view.packets.rows)
+            n = view.own.size
             found.append((view, values[first : first + n]))
             first += n
         return found
@@ -95,8 +122,9 @@ class SchurPattern(eqx.Module):
         pairs are more than this share of those of the dense arrow: little would be left out.
         """
         s, n_groups, _ = problem.sizes
+        plain = not len(problem.network.layout.all("amplitude"))
         sorted_ = [
-            _sorted(packets, factor.slots.shape[0], problem.sizes)
+            _sorted(packets, factor, problem.sizes, plain)
             for factor, packets in zip(problem.network.factors(), problem.packets, strict=True)
         ]
         found = [table for table in sorted_ if isinstance(table, _Sorted)]
@@ -112,11 +140,11 @@ class SchurPattern(eqx.Module):
             if not isinstance(table, _Sorted):
                 tables.append(table)
                 continue
-            own, of_packet = _view(table, factor.slots.shape[1], s)
+            own, of_packet = _view(table, factor)
             tables.append(own)
             view.append(n_views + of_packet)
-            columns.append(np.asarray(own.columns))
-            n_views += len(own.columns)
+            columns.append(np.asarray(own.view_columns))
+            n_views += len(own.view_columns)
         # One view without unknowns stands for what fills up.
         columns = [*columns, np.full((1, 0), s)]
         columns = np.concatenate(
@@ -130,31 +158,34 @@ class SchurPattern(eqx.Module):
             groups=_of_used(group, n_groups),
             group=jnp.asarray(group),
             pairs=pairs,
-            pair_rows=jnp.asarray(columns[a]),
-            pair_columns=jnp.asarray(columns[b]),
             halved=jnp.asarray(np.where(a == b, 0.5, 1.0)),
+            **_entries(columns[a], columns[b], s),
+            wide=wide,
             sizes=problem.sizes,
         )
 
 
 @dataclass(frozen=True, eq=False)
 class _Sorted:
-    """Packets of a table with local unknowns: rows, shared unknowns (one past the last where there
-    is none), group, live positions, which of them are shared and local, and which are tied."""
+    """Packets of a table with local unknowns: rows, runs, shared unknowns of a run (one past the
+    last where there is none), group, live positions, which are shared and local, which are tied."""
 
     rows: Int[np.ndarray, "packets width"]
-    columns: Int[np.ndarray, "packets shared"]
+    own: Float[np.ndarray, "runs length"]
+    columns: Int[np.ndarray, "runs shared"]
     group: Int[np.ndarray, " packets"]
     live: Int[np.ndarray, " live"]
     shared_at: Int[np.ndarray, " shared"]
     local_at: Int[np.ndarray, " d"]
     tied: tuple[tuple[int, ...], ...]
+    tiled: bool
 
 
-def _sorted(packets: Packets, n: int, sizes: tuple[int, int, int]) -> _Sorted | Packets | None:
-    """Shared and local unknowns of a table of n rows apart; the packets themselves if none is
-    local, None where both stand at one place."""
+def _sorted(packets: Packets, factor: Factor, sizes, plain: bool) -> _Sorted | Packets | None:
+    """Shared and local unknowns of a table apart; the packets themselves if none is local, None
+    where both stand at one place. `plain` says that no effects act."""
     s, n_groups, d = sizes
+    n = factor.slots.shape[0]
     held = s + n_groups * d
     at, rows = np.asarray(packets.columns), np.asarray(packets.rows)
     local = (at >= s) & (at < held)
@@ -165,45 +196,57 @@ def _sorted(packets: Packets, n: int, sizes: tuple[int, int, int]) -> _Sorted | 
         return None
     shared_at, local_at = split
     used = local.any(axis=1)
+    own = np.ones((len(rows), 1))
+    tiles = factor.tiles if isinstance(factor, PixelFactor) else None
+    tiled = rows.shape[1] == 1 and plain and tiles is not None
     if rows.shape[1] == 1:
-        # One row a packet: in the order of the table nothing has to be gathered.
+        # One row a packet: in the order of the table, or of its tiles, nothing has to be gathered.
         order = np.full(n, len(rows))
         real = rows[:, 0] < n
         order[rows[real, 0]] = np.flatnonzero(real)
-        at = np.concatenate([at, np.full((1, at.shape[1]), held)])[order]
-        used = np.append(used, False)[order]
         rows = np.arange(n)[:, None]
-    columns = np.minimum(at[:, shared_at], s)
+        own = np.ones((n, 1))
+        if tiles is not None and tiled:
+            whole, place = np.asarray(tiles.rows), np.asarray(tiles.place)
+            rows = whole.reshape(-1, 1)
+            own = place[whole] == np.arange(whole.size).reshape(whole.shape)
+            order = order[rows[:, 0]]
+        at = np.concatenate([at, np.full((1, at.shape[1]), held)])[order]
+        used = np.append(used, False)[order] & own.ravel().astype(bool)
+    columns = np.minimum(at[:: own.shape[1]][:, shared_at], s)
     tied = _tied(columns)
     group = np.where(used, (at[:, local_at].min(axis=1, initial=held) - s) // d, n_groups)
-    live = np.array(packets.live)
     columns = columns[:, [together[0] for together in tied]]
-    return _Sorted(rows, columns, group, live, shared_at, local_at, tied)
+    live = np.array(packets.live)
+    return _Sorted(rows, own.astype(float), columns, group, live, shared_at, local_at, tied, tiled)
 
 
-def _view(table: _Sorted, n_own: int, s: int) -> tuple[View, Int[np.ndarray, " packets"]]:
+def _view(table: _Sorted, factor: Factor) -> tuple[View, Int[np.ndarray, " packets"]]:
     """The views of a table, and the view of each of its packets."""
-    # Rows with the same unknowns have the same sum of hashes.
+    # Runs with the same unknowns have the same sum of hashes.
     hashes = np.random.default_rng(0).integers(1 << 62, size=table.columns.shape[1], dtype=np.int64)
     _, where, view = np.unique(table.columns @ hashes, return_index=True, return_inverse=True)
-    columns = table.columns[where]
     # Derivatives come with the table's own positions first, then effects.
-    k = int(np.sum(table.live[table.shared_at] < n_own))
+    k = int(np.sum(table.live[table.shared_at] < factor.slots.shape[1]))
     order = np.concatenate([table.shared_at[:k], table.local_at, table.shared_at[k:]])
-    live = tuple(table.live[order].tolist())
-    each = np.arange(len(view))
-    squares = Products.of(view, len(columns), each, each, len(each))
-    with_none = np.append(columns, np.full((1, columns.shape[1]), s), axis=0)
+    live, local = table.live[order], table.live[table.local_at]
+    own = table.rows.reshape((*table.own.shape, -1))[..., 0]
+    slots = np.asarray(factor.slots) if table.tiled else np.zeros((1, 1 + live.max()), int)
+    own = own if table.tiled else np.zeros((1, 1), int)
     found = View(
-        packets=Packets(jnp.asarray(table.rows), jnp.asarray(table.columns), live),
-        views=Buckets.of(view, len(columns), 1.5),
-        squares=squares,
-        square_columns=jnp.asarray(with_none[squares.list]),
-        columns=jnp.asarray(columns),
+        rows=jnp.asarray(table.rows),
+        own=jnp.asarray(table.own),
+        columns=jnp.asarray(table.columns),
+        views=Buckets.of(view, len(where), 1.5),
+        view_columns=jnp.asarray(table.columns[where]),
+        slots=jnp.asarray(slots[own[:, :1]][..., live]),
+        local_slots=jnp.asarray(slots[own][..., local]),
+        live=tuple(live.tolist()),
         local=(k, k + len(table.local_at)),
         tied=table.tied,
+        tiled=table.tiled,
     )
-    return found, view
+    return found, np.repeat(view, table.own.shape[1])
 
 
 def _pairs(group, view, n_groups: int, n_views: int):
@@ -218,6 +261,18 @@ def _pairs(group, view, n_groups: int, n_views: int):
     key = view[p] * n_views + view[q]
     met = np.bincount(key, minlength=1) > 0
     return p, q, np.flatnonzero(met), (np.cumsum(met) - 1)[key]
+
+
+def _entries(rows, columns, s: int) -> dict[str, Array]:
+    """Where entries of the reduced matrix come from: gathered, but for what adds to another one."""
+    key = (rows[:, :, None] * s + columns[:, None, :]).ravel()
+    used = ((rows < s)[:, :, None] & (columns < s)[:, None, :]).ravel()
+    source = np.flatnonzero(used)
+    entry = np.full(s * s, len(key))
+    entry[key[source]] = source
+    more = source[entry[key[source]] != source]
+    found = {"entry": entry, "further": more, "place": key[more]}
+    return {name: jnp.asarray(value) for name, value in found.items()}
 
 
 def _of_used(group: Int[np.ndarray, " packets"], n_groups: int) -> Buckets:
