@@ -220,7 +220,7 @@ def product(a, b):
     return a * b
 
 
-def total(numbers):
+def total(numbers) -> Any:
     """Sum of numbers."""
     return functools.reduce(_sum, numbers, np.float64(0.0))
 

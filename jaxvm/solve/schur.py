@@ -85,19 +85,19 @@ def _linearised(problem: Problem, pattern: SchurPattern, x):
     cost, products, rest = jnp.zeros(()), [], []
     for factor, view in zip(network.factors(), pattern.tables, strict=True):
         if isinstance(view, View) and view.tiled:
-            square, value, jacobian = _of_tiles(problem, factor, view, at, per_parameter)
+            square, *numbers = _of_tiles(problem, factor, view, at, per_parameter)
+            products.append((view, *_products(view, *numbers)))
         else:
             raw = linearise(factor, network, at, view.live)
             steps = factor.slots, effects, view.live
             (table,) = whitened([raw], [(factor.weight, factor.sigma)], [steps], per_parameter)
             square = jnp.sum(table.value**2, axis=1)
             if isinstance(view, View):
-                value, jacobian = _of_packets(problem, table, view, square)
+                numbers = _of_packets(problem, table, view, square)
+                products.append((view, *_products(view, *numbers)))
             else:
                 rest.append((table, view, factor.slots.shape[1]))
         cost = cost + 0.5 * jnp.sum(problem.loss.value(square))
-        if isinstance(view, View):
-            products.append((view, *_products(view, value, jacobian)))
     s = problem.sizes[0]
     found = [t for t, *_ in rest], tuple(p for _, p, _ in rest), [n for *_, n in rest]
     return cost, *_joined(pattern, products, assemble(*found, problem.loss, (s, 0, 0)))
