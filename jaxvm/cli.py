@@ -209,8 +209,8 @@ def _parser() -> argparse.ArgumentParser:
     convert.add_argument(
         "source",
         help="table of corners (.csv), mrcal's corners (.vnl) or .cameramodel, OpenCV's "
-        "calibration (.yml, .xml), a pose graph (.g2o, .g2o.gz), the folder of a recording, or the "
-        "name of a public one",
+        "calibration (.yml, .xml), a pose graph (.g2o, .g2o.gz), a problem of bundle adjustment "
+        "(.txt, .txt.gz, libmv's .bin), the folder of a recording, or the name of a public one",
     )
     convert.add_argument(
         "--out", type=Path, required=True, metavar="RECORDING", help="a folder, or a .g2o file"

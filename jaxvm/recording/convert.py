@@ -16,6 +16,7 @@ from jaxvm.recording.importers import (
     import_corners_vnl,
     import_opencv_calibration,
 )
+from jaxvm.recording.libmv import import_libmv
 from jaxvm.recording.model import camera_table
 from jaxvm.recording.read import read_recording
 from jaxvm.recording.recording import Recording
@@ -41,7 +42,8 @@ def convert(
     recording.toml with its cameras, to which targets and tables are to be added. A pose graph
     (.g2o, .g2o.gz) becomes stations and links, with `mend` where its information is not positive
     definite; where `out` is such a file, stations and links become a pose graph. A problem of
-    bundle adjustment (.txt, .txt.gz) becomes cameras and one target whose points are free.
+    bundle adjustment (.txt, .txt.gz) becomes cameras and one target whose points are free, one of
+    libmv (.bin) one camera whose station moves.
 
     Raises:
         RecordingError: the source is wrong, or needs a number that was not given.
@@ -81,12 +83,14 @@ def convert(
         recording = import_g2o(path, mend)
     elif path.name.endswith((".txt", ".txt.gz")):
         recording = import_bal(path)
+    elif kind == ".bin":
+        recording = import_libmv(path)
     elif kind == ".cameramodel":
         recording = import_cameramodel(path)
     else:
         raise RecordingError(
             f"{source}: it is no folder, no public recording ({', '.join(DATASETS)}), and no .csv, "
-            ".vnl, .cameramodel, .g2o, .txt (bundle adjustment), .yml or .xml file; mend the name"
+            ".vnl, .cameramodel, .g2o, .txt, .bin (bundle adjustment), .yml, .xml; mend the name"
         )
     if Path(out).name.endswith((".g2o", ".g2o.gz")):
         if Path(out).exists():
