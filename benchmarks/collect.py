@@ -26,8 +26,9 @@ def questions() -> list[tuple[str, str, str]]:
 def section(name: str, question: str, command: str) -> list[str]:
     """A folder's tables, one level down, and its figures."""
     lines = [f"## {name}", "", question, "", f"Command: {command}", ""]
-    tables = sorted((HERE / name).glob("results*.md"), key=_age)
-    for table in tables[-1:]:
+    tables = sorted((HERE / name).glob("results*.md"), key=lambda table: (_age(table), table.stem))
+    # Of the sealed sets the last one.
+    for table in tables[-1:] if name == "sealed" else tables:
         text = table.read_text().rstrip()
         # Long lists (every case of a benchmark) stay in the folder.
         head = re.split(r"^## (?:By hidden effect|What went wrong)", text, flags=re.M)[0].rstrip()

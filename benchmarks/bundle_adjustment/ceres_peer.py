@@ -79,8 +79,7 @@ def captured(function):
         return file.read().decode()
 
 
-def solve(problem, solver, iterations):
-    scene = reconstruction(*problem)
+def solve(scene, solver, iterations):
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.refine_principal_point = False
@@ -125,7 +124,10 @@ def main():
     asked.add_argument("--iterations", type=int, default=100)
     options = asked.parse_args()
     problem = read(options.file)
-    runs = [solve(problem, options.solver, options.iterations) for _ in range(options.repeats)]
+    runs = [
+        solve(reconstruction(*problem), options.solver, options.iterations)
+        for _ in range(options.repeats)
+    ]
     print(json.dumps({"ceres": pycolmap.__ceres_version__, "runs": runs}))
 
 
