@@ -71,15 +71,16 @@ def test_the_cost_is_that_of_the_format(tmp_path):
     assert float(problem.cost(jnp.zeros(problem.n))) == pytest.approx(0.0625 * len(pixel), rel=1e-9)
 
 
+@pytest.mark.parametrize("reduced", ["dense", "sparse"])
 @pytest.mark.parametrize("loss", [SquaredLoss(), HuberLoss(1.0)])
 @pytest.mark.parametrize("which", ["block", "free points"])
-def test_steps_are_those_of_the_dense_arrow(scene, which, loss):
+def test_steps_are_those_of_the_dense_arrow(scene, which, loss, reduced):
     if which == "free points":
         # Several epochs: a view has many packets, points and poses are of several kinds.
         scene = free_points_recording().true_scene()
     problem = scene_problem(scene, loss)
     problem, dense = scaled(problem, normal_at(problem, jnp.zeros(problem.n)))
-    pattern = SchurPattern.of(problem, share=np.inf)
+    pattern = SchurPattern.of(problem, share=np.inf, dense=reduced == "dense")
     assert pattern is not None
     normal = schur_normal(problem, pattern, jnp.zeros(problem.n))
     assert normal.cost == pytest.approx(float(dense.cost), rel=1e-12)
@@ -106,7 +107,7 @@ def test_adjustments_end_at_the_same_cost(scene, monkeypatch):
     options = dict(check=False, damping=1e-4, rtol=1e-12)
     dense = adjust(scene, **options)
     monkeypatch.setattr(large, "_WIDE", 0)
-    monkeypatch.setattr(SchurPattern.of.__func__, "__defaults__", (np.inf,))
+    monkeypatch.setattr(SchurPattern.of.__func__, "__defaults__", (np.inf, True))
     problem = scene_problem(scene)
     assert isinstance(large.prepared(problem)[2], SchurFactors)
     found = adjust(scene, **options)

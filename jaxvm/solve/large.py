@@ -38,6 +38,10 @@ _WIDE = 1_000_000
 """Couplings of groups with shared unknowns beyond which those that are zero are left out."""
 
 
+_MOSTLY_LOCAL = 4.0
+"""Local over shared unknowns beyond which groups are eliminated first in a sparse matrix, too."""
+
+
 def is_large(problem: Problem) -> bool:
     """Whether covariances of a problem come from sparse factors on the host."""
     s, groups, d = problem.sizes
@@ -74,12 +78,14 @@ def prepared(problem: Problem) -> tuple[Problem, Equations, Factors] | None:
     """A problem with unknowns scaled to a unit diagonal, its normal equations at x = 0, and a place
     for their factors; None where the dense arrow is quicker.
 
-    Many groups that each touch few of some hundred shared unknowns are eliminated one by one
-    (`jaxvm.solve.schur`); beyond that everything is one sparse matrix (`jaxvm.solve.sparse`).
+    Many groups that each touch few of the shared unknowns are eliminated one by one
+    (`jaxvm.solve.schur`), what is left is dense or sparse; where most unknowns are shared,
+    everything is one sparse matrix (`jaxvm.solve.sparse`).
     """
     s, groups, d = problem.sizes
-    if s <= _DENSE and s * groups * d > _WIDE:
-        pattern = SchurPattern.of(problem)
+    dense = s <= _DENSE
+    if s * groups * d > _WIDE and (dense or groups * d > _MOSTLY_LOCAL * s):
+        pattern = SchurPattern.of(problem, dense=dense)
         if pattern is not None:
             normal = schur_normal(problem, pattern, jnp.zeros(problem.n))
             return *_unit(problem, normal), SchurFactors(pattern)

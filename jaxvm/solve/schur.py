@@ -12,15 +12,15 @@ from dataclasses import dataclass, replace
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.scipy.linalg as jsl
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxvm.network.componentwise import Numbers, apart, each, is_known, joined, matmul, total
 from jaxvm.network.residual import Linearised, linearise, linearise_tiles, present
-from jaxvm.solve.buckets import padded, taken
+from jaxvm.solve.buckets import padded
 from jaxvm.solve.problem import Problem, assemble, flat_state, in_packets, whitened
 from jaxvm.solve.schur_pattern import SchurPattern, View
+from jaxvm.solve.triangle import solver
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +28,7 @@ class SchurNormal:
     """Cost, gradient and Gauss-Newton matrix at one x, in blocks.
 
     Attributes:
-        shared: of shared unknowns among themselves.
+        shared: of shared unknowns among themselves, in the entries of the pattern's triangle.
         local: of each group.
         coupling: of each packet, the unknowns of its group with its shared ones.
     """
@@ -36,7 +36,7 @@ class SchurNormal:
     pattern: SchurPattern
     cost: float
     gradient: Float[Array, " n"]
-    shared: Float[Array, "s s"]
+    shared: Float[Array, " entries"]
     local: Float[Array, "groups d d"]
     coupling: Float[Array, "packets d shared"]
 
@@ -57,7 +57,7 @@ class SchurNormal:
         return replace(
             self,
             gradient=self.gradient * scale,
-            shared=a[:, None] * self.shared * a,
+            shared=self.shared * a[self.pattern.triangle.row] * a[self.pattern.triangle.column],
             local=b[:, :, None] * self.local * b[:, None, :],
             coupling=jnp.concatenate([jnp.reshape(own, (-1, d, wide)) for own in coupling]),
         )
@@ -65,7 +65,7 @@ class SchurNormal:
     def diagonal(self) -> Float[np.ndarray, " n"]:
         """Diagonal of the matrix."""
         own = jnp.diagonal(self.local, axis1=1, axis2=2)
-        return np.concatenate([np.diagonal(self.shared), np.ravel(own)])
+        return np.concatenate([self.shared[self.pattern.triangle.diagonal], np.ravel(own)])
 
 
 def schur_normal(problem: Problem, pattern: SchurPattern, x: Float[Array, " n"]) -> SchurNormal:
@@ -100,7 +100,8 @@ def _linearised(problem: Problem, pattern: SchurPattern, x):
         cost = cost + 0.5 * jnp.sum(problem.loss.value(square))
     s = problem.sizes[0]
     found = [t for t, *_ in rest], tuple(p for _, p, _ in rest), [n for *_, n in rest]
-    return cost, *_joined(pattern, products, assemble(*found, problem.loss, (s, 0, 0)))
+    others = assemble(*found, problem.loss, (s, 0, 0)) if rest else None
+    return cost, *_joined(pattern, products, others)
 
 
 def _of_tiles(problem: Problem, factor, view: View, at, per_parameter):
@@ -155,12 +156,17 @@ def _joined(pattern: SchurPattern, products, rest):
     """Sums over views and groups."""
     s, _, d = pattern.sizes
     wide = pattern.wide
-    shared = jnp.zeros((s + 1, s + 1)).at[:s, :s].add(rest.hessian.shared)
-    gradient = jnp.zeros(s + 1).at[:s].add(rest.gradient)
-    for view, block, *_ in products:
-        at, whole = view.view_columns, view.views.sums(block)
-        shared = shared.at[at[:, :, None], at[:, None, :]].add(whole[:, :-1, :-1])
-        gradient = gradient.at[at].add(whole[:, :-1, -1])
+    shared = jnp.zeros(len(pattern.triangle.row))
+    gradient = jnp.zeros(s + 1)
+    if rest is not None:
+        shared = (
+            shared + jnp.tril(rest.hessian.shared)[pattern.triangle.row, pattern.triangle.column]
+        )
+        gradient = gradient.at[:s].add(rest.gradient)
+    for (view, block, *_), places in zip(products, pattern.of_views, strict=True):
+        whole = view.views.sums(block)
+        shared = shared + places.sums(jnp.ravel(whole[:, :-1, :-1]))
+        gradient = gradient.at[view.view_columns].add(whole[:, :-1, -1])
     couplings = [
         jnp.pad(own, ((0, 0), (0, 0), (0, wide - own.shape[2]))) for _, _, own, _ in products
     ]
@@ -170,7 +176,7 @@ def _joined(pattern: SchurPattern, products, rest):
     local = own[:, np.maximum(place, place.T)]
     return (
         jnp.concatenate([gradient[:s], jnp.ravel(own[:, -d:])]),
-        shared[:s, :s],
+        shared,
         local,
         jnp.concatenate(couplings),
     )
@@ -191,13 +197,13 @@ class SchurFactors:
 
     def __init__(self, pattern: SchurPattern):
         self.pattern = pattern
+        self._shared = solver(pattern.triangle)
 
     def factorise(self, normal: SchurNormal, damping: float = 0.0) -> bool:
         """Factorise the matrix with its diagonal raised by `damping` of itself; False where it is
         not definite."""
         self._lower, self._half = _eliminated(normal.local, normal.coupling, self.pattern, damping)
-        self._reduced, sound = _reduced(normal.shared, self._half, self.pattern, damping)
-        return bool(sound)
+        return self._shared.factorise(_reduced(normal.shared, self._half, self.pattern, damping))
 
     def damped(self, normal: SchurNormal) -> Float[np.ndarray, " n"]:
         """What damping is relative to: the present diagonal (Marquardt 1963)."""
@@ -205,7 +211,9 @@ class SchurFactors:
 
     def solve(self, right: Float[Array, " n"]) -> Float[Array, " n"]:
         """Solution for one right-hand side, with the latest factors."""
-        return _solved(self.pattern, self._lower, self._half, self._reduced, jnp.asarray(right))
+        factors = self.pattern, self._lower, self._half
+        forward, top = _down(*factors, jnp.asarray(right))
+        return _up(*factors, forward, self._shared.solve(top))
 
 
 @jax.jit
@@ -257,21 +265,16 @@ def _along(vector, values):
 
 @jax.jit
 def _reduced(shared, half, pattern: SchurPattern, damping):
-    """Cholesky factor of the reduced matrix, scaled to a unit diagonal, and whether it is sound."""
-    s = shared.shape[0]
-    products = jnp.ravel(pattern.pairs(half) * pattern.halved[:, None, None])
-    off = taken(jnp.append(products, 0.0), pattern.entry)
-    off = off.at[pattern.place].add(taken(products, pattern.further)).reshape(s, s)
-    diagonal = jnp.diagonal(shared)
-    raised = shared + jnp.diag(jnp.where(diagonal > 0.0, damping * diagonal, 1.0))
-    matrix = raised - off - off.T
-    scale = 1.0 / jnp.sqrt(jnp.diagonal(matrix))
-    factor = jnp.linalg.cholesky(scale[:, None] * matrix * scale)
-    return (factor, scale), jnp.all(jnp.isfinite(factor))
+    """Entries of the reduced matrix."""
+    at = pattern.triangle.diagonal
+    diagonal = shared[at]
+    raised = shared.at[at].add(jnp.where(diagonal > 0.0, damping * diagonal, 1.0))
+    return raised - pattern.of_pairs.sums(jnp.ravel(pattern.pairs(half)))
 
 
 @jax.jit
-def _solved(pattern: SchurPattern, lower, half, reduced, right):
+def _down(pattern: SchurPattern, lower, half, right):
+    """Right-hand sides of the groups, forward, and that of the reduced matrix."""
     s, n_groups, d = pattern.sizes
     a, b = right[:s], jnp.reshape(right[s:], (n_groups, d))
     forward = jnp.stack(_forward(lower, [b[:, k] for k in range(d)]), axis=1)
@@ -280,8 +283,13 @@ def _solved(pattern: SchurPattern, lower, half, reduced, right):
     for view, own in pattern.by_table(taken):
         of_runs = jnp.sum(view.in_runs(own), axis=1)[:, : view.n_shared]
         top = top.at[view.view_columns].add(-view.views.sums(of_runs))
-    factor, scale = reduced
-    shared = scale * jsl.cho_solve((factor, True), scale * top[:s])
+    return forward, top[:s]
+
+
+@jax.jit
+def _up(pattern: SchurPattern, lower, half, forward, shared):
+    """All unknowns from the shared ones."""
+    d = pattern.sizes[2]
     seen = jnp.append(shared, 0.0)
     back = [
         jnp.sum(

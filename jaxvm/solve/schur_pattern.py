@@ -14,6 +14,7 @@ from jaxvm.network.componentwise import Numbers, total
 from jaxvm.network.factors import Factor, PixelFactor
 from jaxvm.solve.buckets import Buckets, Products, in_order
 from jaxvm.solve.problem import Packets, Problem
+from jaxvm.solve.triangle import Places, Triangle
 
 
 class View(eqx.Module):
@@ -76,10 +77,9 @@ class SchurPattern(eqx.Module):
         groups: packets of each group.
         group: of each packet; the number of groups where it fills up.
         pairs: packets of one group by the pair of views that they fall on.
-        halved: factor on each pair: 1/2 for a view with itself, because pairs count both ways.
-        entry: of all products of pairs, the one that each entry of the reduced matrix takes; their
-            number where there is none.
-        further, place: products that are added to an entry that has one, and the entry.
+        triangle: entries of the reduced matrix.
+        of_pairs, of_views: which products of pairs, and of views of each table, add up to them.
+        wide: most shared unknowns of a packet.
         sizes: shared unknowns, groups, unknowns of a group.
     """
 
@@ -87,10 +87,9 @@ class SchurPattern(eqx.Module):
     groups: Buckets
     group: Int[Array, " packets"]
     pairs: Products
-    halved: Float[Array, " pairs"]
-    entry: Int[Array, " entries"]
-    further: Int[Array, " more"]
-    place: Int[Array, " more"]
+    triangle: Triangle
+    of_pairs: Places
+    of_views: tuple[Places, ...]
     wide: int = eqx.field(static=True)
     sizes: tuple[int, int, int] = eqx.field(static=True)
 
@@ -115,8 +114,8 @@ class SchurPattern(eqx.Module):
         return found
 
     @classmethod
-    def of(cls, problem: Problem, share: float = 0.25) -> "SchurPattern | None":
-        """Pattern of a problem.
+    def of(cls, problem: Problem, share: float = 0.25, dense: bool = True) -> "SchurPattern | None":
+        """Pattern of a problem; whether its reduced matrix is dense.
 
         None where a table mixes shared and local unknowns at one place, and where the products of
         pairs are more than this share of those of the dense arrow: little would be left out.
@@ -152,17 +151,45 @@ class SchurPattern(eqx.Module):
         )
         p, q, distinct, of_pair = _pairs(group, np.concatenate(view), n_groups, n_views)
         pairs = Products.of(of_pair, len(distinct), p, q, len(group))
-        a, b = np.where(pairs.list < 0, n_views, np.array(divmod(distinct, n_views))[:, pairs.list])
+        of_list = np.array(divmod(distinct, n_views))[:, pairs.list]
+        a, b = np.where(pairs.list < 0, n_views, of_list)
+        number, key = _products(columns[a], columns[b], a == b, s)
+        own = [np.asarray(table.view_columns) for table in tables if isinstance(table, View)]
+        of_views = [_products(each, each, np.ones(len(each), bool), s) for each in own]
+        triangle = Triangle.of(np.concatenate([key, *(key for _, key in of_views)]), s, dense)
+        n = len(triangle.row)
         return cls(
             tables=tuple(tables),
             groups=_of_used(group, n_groups),
             group=jnp.asarray(group),
             pairs=pairs,
-            halved=jnp.asarray(np.where(a == b, 0.5, 1.0)),
-            **_entries(columns[a], columns[b], s),
+            triangle=triangle,
+            of_pairs=Places.of(number, triangle.place(key), a.size * wide**2, n),
+            of_views=tuple(
+                Places.of(number, triangle.place(key), each.size * each.shape[1], n)
+                for each, (number, key) in zip(own, of_views, strict=True)
+            ),
             wide=wide,
             sizes=problem.sizes,
         )
+
+
+def _products(rows, columns, same, s: int):
+    """The numbers of products of matrices that count, and the entry of the lower triangle that each
+    belongs to, as column s + row.
+
+    Args:
+        rows, columns: shared unknowns of both views of each product, [products, k].
+        same: products of a view with itself: of those, half counts.
+    """
+    row, column = np.broadcast_arrays(rows[:, :, None], columns[:, None, :])
+    used = (row < s) & (column < s) & ((row >= column) | ~same[:, None, None])
+    number = np.flatnonzero(used)
+    row, column = row[used], column[used]
+    # An unknown that both views have meets itself both ways.
+    again = (row == column) & ~np.repeat(same, rows.shape[1] * columns.shape[1])[number]
+    key = np.minimum(row, column) * s + np.maximum(row, column)
+    return np.append(number, number[again]), np.append(key, key[again])
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,18 +288,6 @@ def _pairs(group, view, n_groups: int, n_views: int):
     key = view[p] * n_views + view[q]
     met = np.bincount(key, minlength=1) > 0
     return p, q, np.flatnonzero(met), (np.cumsum(met) - 1)[key]
-
-
-def _entries(rows, columns, s: int) -> dict[str, Array]:
-    """Where entries of the reduced matrix come from: gathered, but for what adds to another one."""
-    key = (rows[:, :, None] * s + columns[:, None, :]).ravel()
-    used = ((rows < s)[:, :, None] & (columns < s)[:, None, :]).ravel()
-    source = np.flatnonzero(used)
-    entry = np.full(s * s, len(key))
-    entry[key[source]] = source
-    more = source[entry[key[source]] != source]
-    found = {"entry": entry, "further": more, "place": key[more]}
-    return {name: jnp.asarray(value) for name, value in found.items()}
 
 
 def _of_used(group: Int[np.ndarray, " packets"], n_groups: int) -> Buckets:

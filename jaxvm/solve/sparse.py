@@ -11,16 +11,15 @@ import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
-import cvxopt
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from cvxopt import cholmod  # pyright: ignore[reportAttributeAccessIssue]
 from jaxtyping import Array, Float, Int
 
 from jaxvm.network.residual import linearise, present
 from jaxvm.solve.problem import Packets, Problem, flat_state, whitened
+from jaxvm.solve.triangle import Sparse
 
 _ROWS_AT_A_TIME = 256
 """Rows that are linearised together: their Jacobian stays in the processor's cache."""
@@ -209,27 +208,14 @@ class SparseFactors:
 
     def __init__(self, pattern: Pattern):
         self.pattern = pattern
-        self._matrix = cvxopt.spmatrix(
-            1.0,
-            cvxopt.matrix(pattern.row),
-            cvxopt.matrix(pattern.column),
-            (pattern.n, pattern.n),
-        )
-        self._symbolic = cholmod.symbolic(self._matrix)
+        self._factors = Sparse(pattern.row, pattern.column, pattern.n)
 
     def factorise(self, normal: SparseNormal, damping: float = 0.0) -> bool:
         """Factorise the matrix plus `damping` on its diagonal; False where it is not definite."""
         values = normal.values.copy()
         diagonal = values[self.pattern.diagonal]
         values[self.pattern.diagonal] = np.where(diagonal > 0.0, diagonal + damping, 1.0)
-        if not np.isfinite(values).all():
-            return False
-        self._matrix.V = cvxopt.matrix(values)
-        try:
-            cholmod.numeric(self._matrix, self._symbolic)
-        except ArithmeticError:
-            return False
-        return True
+        return self._factors.factorise(values)
 
     def damped(self, normal: SparseNormal) -> Float[np.ndarray, " n"]:
         """What damping is relative to: the unit diagonal of a scaled problem."""
@@ -237,6 +223,4 @@ class SparseFactors:
 
     def solve(self, right: Float[np.ndarray, "n *k"]) -> Float[np.ndarray, "n *k"]:
         """Solution for one right-hand side or a block of them, with the latest factors."""
-        columns = cvxopt.matrix(np.reshape(right, (self.pattern.n, -1)))
-        cholmod.solve(self._symbolic, columns)
-        return np.reshape(np.array(columns), np.shape(right))
+        return self._factors.solve(right)
