@@ -85,8 +85,8 @@ def _linearised(problem: Problem, pattern: SchurPattern, x):
     cost, products, rest = jnp.zeros(()), [], []
     for factor, view in zip(network.factors(), pattern.tables, strict=True):
         if isinstance(view, View) and view.tiled:
-            square, *numbers = _of_tiles(problem, factor, view, at, per_parameter)
-            products.append((view, *_products(view, *numbers)))
+            own, *found = _by_pieces(problem, factor, view, at, per_parameter)
+            products.append((view, *found))
         else:
             raw = linearise(factor, network, at, view.live)
             steps = factor.slots, effects, view.live
@@ -97,11 +97,35 @@ def _linearised(problem: Problem, pattern: SchurPattern, x):
                 products.append((view, *_products(view, *numbers)))
             else:
                 rest.append((table, view, factor.slots.shape[1]))
-        cost = cost + 0.5 * jnp.sum(problem.loss.value(square))
+            own = 0.5 * jnp.sum(problem.loss.value(square))
+        cost = cost + own
     s = problem.sizes[0]
     found = [t for t, *_ in rest], tuple(p for _, p, _ in rest), [n for *_, n in rest]
     others = assemble(*found, problem.loss, (s, 0, 0)) if rest else None
     return cost, *_joined(pattern, products, others)
+
+
+_PIECE = 4096
+"""Packets of a piece, at least: what is computed on the way stays in the processor's cache."""
+
+
+def _by_pieces(problem: Problem, factor, view: View, at, per_parameter):
+    """Cost and products of a table in tiles, some tiles at a time."""
+    tables = factor.tiles.rows, view.own, view.slots, view.local_slots
+    pieces, (count, width) = 1, view.own.shape
+    while count % (2 * pieces) == 0 and count * width >= 2 * pieces * _PIECE:
+        pieces *= 2
+
+    def piece(some):
+        rows, *parts = some
+        own = eqx.tree_at(lambda f: f.tiles.rows, factor, rows)
+        part = eqx.tree_at(lambda v: (v.own, v.slots, v.local_slots), view, parts)
+        square, *numbers = _of_tiles(problem, own, part, at, per_parameter)
+        return 0.5 * jnp.sum(problem.loss.value(square)), *_products(part, *numbers)
+
+    cut = [jnp.reshape(t, (pieces, count // pieces, *t.shape[1:])) for t in tables]
+    cost, *found = jax.lax.map(piece, cut)
+    return jnp.sum(cost), *(jnp.reshape(part, (-1, *part.shape[2:])) for part in found)
 
 
 def _of_tiles(problem: Problem, factor, view: View, at, per_parameter):
