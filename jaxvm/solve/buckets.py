@@ -4,6 +4,8 @@ XLA adds scattered values one by one on a processor; values that are gathered li
 and multiplied as long vectors. Lists of like length are filled up alike.
 """
 
+import os
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -35,8 +37,10 @@ class Buckets(eqx.Module):
             least = count[order[at]]
             most = max(int(growth * least), least, 1)
             end = int(np.searchsorted(count[order], most, "right"))
+            width = np.arange(max(int(count[order[end - 1]]), 1))
+            # In their own order: neighbouring lists often share members.
+            order[at:end] = np.sort(order[at:end])
             own = order[at:end]
-            width = np.arange(max(int(count[own[-1]]), 1))
             inside = width < count[own, None]
             index = np.minimum(first[own, None] + width, max(len(member) - 1, 0))
             rows.append(jnp.asarray(np.where(inside, member[index], len(owner))))
@@ -47,8 +51,8 @@ class Buckets(eqx.Module):
 
     def sums(self, values: Float[Array, "members ..."]) -> Float[Array, "lists ..."]:
         """Sum of the values of each list."""
-        whole = padded(values)
-        return jnp.concatenate([taken(whole, rows).sum(axis=1) for rows in self.rows])[self.place]
+        parts = [filled(values, rows).sum(axis=1) for rows in self.rows]
+        return taken(jnp.concatenate(parts), self.place)
 
 
 def in_order(numbers: Int[np.ndarray, " n"], bound: int) -> Int[np.ndarray, " n"]:
@@ -61,9 +65,18 @@ def padded(values: Float[Array, "members ..."]) -> Float[Array, "members_and_1 .
     return jnp.concatenate([values, jnp.zeros((1, *values.shape[1:]), values.dtype)])
 
 
+CORES = os.cpu_count() or 1
+"""Shares that are computed side by side."""
+
+
 def taken(values: Float[Array, "members ..."], rows: Int[Array, "..."]) -> Float[Array, "..."]:
     """Values at rows that are known to exist: nothing checks them."""
     return values.at[rows].get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+
+def filled(values: Float[Array, "members ..."], rows: Int[Array, "..."]) -> Float[Array, "..."]:
+    """Values at rows, zero where they point past the end."""
+    return values.at[rows].get(mode="fill", fill_value=0.0, wrap_negative_indices=False)
 
 
 _MEMBERS = 2048
@@ -109,11 +122,14 @@ class Products(eqx.Module):
 
     def __call__(self, values: Float[Array, "rows d k"]) -> Float[Array, "products k k"]:
         """Sum of values[left]^T values[right] over the members of each list."""
-        whole = padded(values)
         k = values.shape[2]
 
         def piece(rows):
-            a, b = (jnp.reshape(taken(whole, own), (own.shape[0], -1, k)) for own in rows)
+            left, right = rows
+            # What fills up is zero on one side; nothing is copied for it.
+            a = filled(values, left)
+            b = values.at[right].get(mode="clip", wrap_negative_indices=False)
+            a, b = (jnp.reshape(own, (own.shape[0], -1, k)) for own in (a, b))
             return jnp.einsum("lra,lrb->lab", a, b)
 
         parts = [

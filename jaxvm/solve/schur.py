@@ -7,6 +7,7 @@ pair are gathered into one product of matrices (Brown 1958; Triggs et al. 2000, 
 et al. 2010).
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import equinox as eqx
@@ -17,7 +18,7 @@ from jaxtyping import Array, Float
 
 from jaxvm.network.componentwise import Numbers, apart, each, is_known, joined, matmul, total
 from jaxvm.network.residual import Linearised, linearise, linearise_tiles, present
-from jaxvm.solve.buckets import padded
+from jaxvm.solve.buckets import CORES, Products, padded
 from jaxvm.solve.problem import Problem, assemble, flat_state, in_packets, whitened
 from jaxvm.solve.schur_pattern import SchurPattern, View
 from jaxvm.solve.triangle import solver
@@ -222,12 +223,18 @@ class SchurFactors:
     def __init__(self, pattern: SchurPattern):
         self.pattern = pattern
         self._shared = solver(pattern.triangle)
+        self._pool = ThreadPoolExecutor(CORES)
 
     def factorise(self, normal: SchurNormal, damping: float = 0.0) -> bool:
         """Factorise the matrix with its diagonal raised by `damping` of itself; False where it is
         not definite."""
         self._lower, self._half = _eliminated(normal.local, normal.coupling, self.pattern, damping)
-        return self._shared.factorise(_reduced(normal.shared, self._half, self.pattern, damping))
+        shares = self.pattern.pairs
+        products = list((self._pool.map if len(shares) > 1 else map)(self._products, shares))
+        return self._shared.factorise(_reduced(normal.shared, products, self.pattern, damping))
+
+    def _products(self, pairs: Products) -> Array:
+        return jax.block_until_ready(_paired(pairs, self._half))
 
     def damped(self, normal: SchurNormal) -> Float[np.ndarray, " n"]:
         """What damping is relative to: the present diagonal (Marquardt 1963)."""
@@ -288,12 +295,17 @@ def _along(vector, values):
 
 
 @jax.jit
-def _reduced(shared, half, pattern: SchurPattern, damping):
+def _paired(pairs: Products, half):
+    return jnp.ravel(pairs(half))
+
+
+@jax.jit
+def _reduced(shared, products, pattern: SchurPattern, damping):
     """Entries of the reduced matrix."""
     at = pattern.triangle.diagonal
     diagonal = shared[at]
     raised = shared.at[at].add(jnp.where(diagonal > 0.0, damping * diagonal, 1.0))
-    return raised - pattern.of_pairs.sums(jnp.ravel(pattern.pairs(half)))
+    return raised - pattern.of_pairs.sums(jnp.concatenate(products))
 
 
 @jax.jit

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxvm.network.componentwise import Numbers, total
 from jaxvm.network.factors import Factor, PixelFactor
-from jaxvm.solve.buckets import Buckets, Products, in_order
+from jaxvm.solve.buckets import CORES, Buckets, Products, in_order
 from jaxvm.solve.problem import Packets, Problem
 from jaxvm.solve.triangle import Places, Triangle
 
@@ -76,7 +76,7 @@ class SchurPattern(eqx.Module):
         tables: views of those with local unknowns, packets of the others.
         groups: packets of each group.
         group: of each packet; the number of groups where it fills up.
-        pairs: packets of one group by the pair of views that they fall on.
+        pairs: packets of one group by the pair of views that they fall on, in shares for the cores.
         triangle: entries of the reduced matrix.
         of_pairs, of_views: which products of pairs, and of views of each table, add up to them.
         wide: most shared unknowns of a packet.
@@ -86,7 +86,7 @@ class SchurPattern(eqx.Module):
     tables: tuple[View | Packets, ...]
     groups: Buckets
     group: Int[Array, " packets"]
-    pairs: Products
+    pairs: tuple[Products, ...]
     triangle: Triangle
     of_pairs: Places
     of_views: tuple[Places, ...]
@@ -150,9 +150,8 @@ class SchurPattern(eqx.Module):
             [np.pad(own, ((0, 0), (0, wide - own.shape[1])), constant_values=s) for own in columns]
         )
         p, q, distinct, of_pair = _pairs(group, np.concatenate(view), n_groups, n_views)
-        pairs = Products.of(of_pair, len(distinct), p, q, len(group))
-        of_list = np.array(divmod(distinct, n_views))[:, pairs.list]
-        a, b = np.where(pairs.list < 0, n_views, of_list)
+        pairs, list_ = _shared_out(of_pair, len(distinct), p, q, len(group))
+        a, b = np.where(list_ < 0, n_views, np.array(divmod(distinct, n_views))[:, list_])
         number, key = _products(columns[a], columns[b], a == b, s)
         own = [np.asarray(table.view_columns) for table in tables if isinstance(table, View)]
         of_views = [_products(each, each, np.ones(len(each), bool), s) for each in own]
@@ -172,6 +171,28 @@ class SchurPattern(eqx.Module):
             wide=wide,
             sizes=problem.sizes,
         )
+
+
+_SHARE = 150_000
+"""Pairs of packets of a share, at least: threads cost something, too."""
+
+
+def _shared_out(of_pair, n: int, p, q, end: int):
+    """Products of pairs in shares of about as many members, and the pair of each product."""
+    before = np.cumsum(np.bincount(of_pair, minlength=n))
+    n_shares = min(max(len(of_pair) // _SHARE, 1), CORES)
+    share = np.minimum(before * n_shares // max(len(of_pair), 1), n_shares - 1)
+    shares, lists = [], []
+    for k in range(n_shares):
+        own, pairs = np.flatnonzero(share[of_pair] == k), np.flatnonzero(share == k)
+        if not len(pairs):
+            continue
+        number = np.full(n, -1)
+        number[pairs] = np.arange(len(pairs))
+        found = Products.of(number[of_pair[own]], len(pairs), p[own], q[own], end)
+        shares.append(found)
+        lists.append(np.where(found.list < 0, -1, pairs[found.list]))
+    return tuple(shares), np.concatenate(lists)
 
 
 def _products(rows, columns, same, s: int):
@@ -324,7 +345,7 @@ def _pairs_in_groups(group, n_groups: int):
     count = np.bincount(group[used], minlength=n_groups)
     first = np.cumsum(count) - count
     left, right = [np.zeros(0, int)], [np.zeros(0, int)]
-    for size in np.unique(count[count > 0]):
+    for size in np.flatnonzero(np.bincount(count[count > 0])):
         start = first[count == size]
         a, b = np.triu_indices(size)
         left.append(member[(start[:, None] + a).ravel()])

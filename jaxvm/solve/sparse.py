@@ -7,7 +7,6 @@ finds local unknowns by itself. Packets are linearised and multiplied in one com
 keeps no Jacobian; only their small blocks reach the host.
 """
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -18,13 +17,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxvm.network.residual import linearise, present
+from jaxvm.solve.buckets import CORES
 from jaxvm.solve.problem import Packets, Problem, flat_state, whitened
 from jaxvm.solve.triangle import Sparse
 
 _ROWS_AT_A_TIME = 256
 """Rows that are linearised together: their Jacobian stays in the processor's cache."""
-
-_CORES = os.cpu_count() or 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,16 +88,16 @@ def _shares(tables: tuple[Packets, ...], n: int) -> tuple[tuple[Packets, ...], .
     """
 
     def part(packets: Packets, k: int) -> Packets:
-        height = -(-packets.rows.shape[0] // _CORES)
+        height = -(-packets.rows.shape[0] // CORES)
         rows, columns = np.asarray(packets.rows), np.asarray(packets.columns)
-        spare = height * _CORES - len(rows)
+        spare = height * CORES - len(rows)
         # An empty packet has rows past the last one, and unknowns, too.
         rows = np.pad(rows, ((0, spare), (0, 0)), constant_values=np.iinfo(np.int64).max)
         columns = np.pad(columns, ((0, spare), (0, 0)), constant_values=n)
         own = slice(k * height, (k + 1) * height)
         return Packets(jnp.asarray(rows[own]), jnp.asarray(columns[own]), packets.live)
 
-    return tuple(tuple(part(packets, k) for packets in tables) for k in range(_CORES))
+    return tuple(tuple(part(packets, k) for packets in tables) for k in range(CORES))
 
 
 @dataclass(frozen=True, eq=False)

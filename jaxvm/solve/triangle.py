@@ -77,7 +77,8 @@ class Triangle(eqx.Module):
         if dense:
             row, column = np.divmod(np.arange(n * n), n)
             return cls(jnp.asarray(row), jnp.asarray(column), jnp.arange(n) * (n + 1), True)
-        every = np.unique(np.concatenate([key, np.arange(n) * (n + 1)]))
+        every = np.sort(np.concatenate([key, np.arange(n) * (n + 1)]))
+        every = every[np.append(True, every[1:] > every[:-1])]
         diagonal = np.searchsorted(every, np.arange(n) * (n + 1))
         row, column = jnp.asarray(every % n), jnp.asarray(every // n)
         return cls(row, column, jnp.asarray(diagonal), False)
