@@ -13,6 +13,9 @@ need it. The settings below are made unless the environment already has them:
   every loop that needs it: barriers stay.
 - The C library gives blocks of 32 MB and more back to the system and takes the next ones anew, page
   by page, which costs more than what is computed in them: up to 1 GB they are kept.
+
+Compiled programs stay in the user's cache folder, so that a second run starts at once;
+JAX_COMPILATION_CACHE_DIR names another folder, JAX_ENABLE_COMPILATION_CACHE=false keeps none.
 """
 
 import ctypes
@@ -37,7 +40,15 @@ if sys.platform == "linux" and not any("MALLOC" in name for name in os.environ):
     _mallopt(_M_TOP_PAD, 1 << 26)
 
 import jax  # noqa: E402
+from platformdirs import user_cache_path  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
+if jax.config.jax_compilation_cache_dir is None:
+    _folder = user_cache_path("jaxvm") / f"compiled-{jax.__version__}"
+    jax.config.update("jax_compilation_cache_dir", str(_folder))
+if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
+    # Small programs are kept, too: there are hundreds, and each takes a tenth of a second.
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 __version__ = "0.1.0"

@@ -47,9 +47,7 @@ def _report(diagnosis, out: Path, data_only: bool = False) -> tuple[dict[str, An
 
 def run_demo(options):
     from jaxvm.demo import demo, paragraph
-    from jaxvm.solve.compiling import keep_compiled
 
-    keep_compiled()
     shown = demo(options.seed, options.hide, options.size, options.out, _progress(options))
     answer, text = _report(shown.diagnosis, options.out)
     answer["hidden"] = [truth.effect for truth in shown.truth]
@@ -58,9 +56,7 @@ def run_demo(options):
 
 
 def run_diagnose(options):
-    from jaxvm.solve.compiling import keep_compiled
 
-    keep_compiled()
     if not 0.0 < options.alpha < 1.0:
         raise ValueError(f"--alpha is {options.alpha:g}; it is a probability between 0 and 1")
     if len(options.recording) == 1:
@@ -107,13 +103,11 @@ def run_adjust(options):
     from jaxvm.recording.files import json_text, write_files
     from jaxvm.report.network import write_network_page
     from jaxvm.solve.adjust import adjust, pixel_rms
-    from jaxvm.solve.compiling import keep_compiled
     from jaxvm.solve.covariance import standard_deviations
     from jaxvm.solve.optimise import METHODS
     from jaxvm.solve.robust import LOSSES
     from jaxvm.solve.snooping import snoop_links
 
-    keep_compiled()
     progress = _progress(options)
     progress("start values from the data")
     scene = start(build(_open(options.recording, options.model)), options.start)
@@ -173,9 +167,7 @@ def run_adjust(options):
 def run_identify(options):
     from jaxvm.identify import identify
     from jaxvm.recording.files import write_files
-    from jaxvm.solve.compiling import keep_compiled
 
-    keep_compiled()
     recording = _open(options.recording, options.model)
     found = identify(recording, one_step=not options.two_steps, progress=_progress(options))
     write_files(options.out.absolute().parent, {options.out.name: found.model.text()})
@@ -187,9 +179,7 @@ def run_compensate(options):
     from jaxvm.identify import compensate, read_drift_model
     from jaxvm.identify.poses import image_poses
     from jaxvm.recording import write_recording
-    from jaxvm.solve.compiling import keep_compiled
 
-    keep_compiled()
     progress = _progress(options)
     recording, model = _open(options.recording), read_drift_model(options.model)
     found = compensate(recording, model)
@@ -228,7 +218,6 @@ def run_simulate(options):
 def _simulate_network(options):
     from jaxvm.recording import describe
     from jaxvm.scenes import read_description, simulate_network
-    from jaxvm.solve.compiling import keep_compiled
 
     for name in ("hide", "size", "strength"):
         if getattr(options, name) is not None:
@@ -236,7 +225,6 @@ def _simulate_network(options):
                 f"--{name} is for deformation; what a network hides stands in its TOML, as "
                 '[[effects]] with model = "hidden"'
             )
-    keep_compiled()
     made = simulate_network(read_description(options.scene), options.seed)
     truth = made.write(options.out, options.truth)
     told, hidden = describe(made.recording), list(made.truth.hidden)
@@ -258,9 +246,7 @@ def run_montecarlo(options):
     from jaxvm.network.scene import build
     from jaxvm.recording.files import json_text, write_files
     from jaxvm.scenes import description_text, read_description, simulate_network
-    from jaxvm.solve.compiling import keep_compiled
 
-    keep_compiled()
     progress = _progress(options)
     noise = noise_by_name(options.noise)
     made = simulate_network(read_description(options.scene), noise=0.0)

@@ -12,7 +12,6 @@ import pytest
 from networks import board_recording
 from pose_networks import network
 
-import jaxvm.cli
 from jaxvm.cli import Interruption, main
 from jaxvm.recording import read_recording, write_recording
 from jaxvm.recording.g2o import import_g2o, write_g2o
@@ -20,9 +19,7 @@ from jaxvm.simulate import HIDEABLE
 
 
 @pytest.fixture
-def board(tmp_path, monkeypatch):
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "compiled"))
-    monkeypatch.setattr(jaxvm.solve.compiling, "keep_compiled", lambda: None)
+def board(tmp_path):
     return write_recording(board_recording().recording, tmp_path / "board")
 
 
@@ -72,7 +69,6 @@ def test_bad_recording(command, board, tmp_path, capsys):
 )
 def test_bad_arguments(arguments, words, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(jaxvm.solve.compiling, "keep_compiled", lambda: None)
     assert main([*arguments, "--quiet"] if arguments[0] == "demo" else arguments) == 2
     assert words in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
@@ -142,9 +138,8 @@ def test_interrupted_run_leaves_nothing(board, tmp_path):
     assert not [f for f in tmp_path.iterdir() if f.name.startswith(".")]
 
 
-def test_a_pose_graph_goes_in_and_out(tmp_path, capsys, monkeypatch):
+def test_a_pose_graph_goes_in_and_out(tmp_path, capsys):
     """A gross error among its links is named; the pictures are written; g2o comes out again."""
-    monkeypatch.setattr(jaxvm.solve.compiling, "keep_compiled", lambda: None)
     recording = network(seed=2).recording
     pose = recording.links.pose.copy()
     pose[7, 3:] += 2.0
@@ -171,8 +166,7 @@ def test_a_pose_graph_goes_in_and_out(tmp_path, capsys, monkeypatch):
     assert "--model goes with a folder" in capsys.readouterr().err
 
 
-def test_monte_carlo_of_a_described_network(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(jaxvm.solve.compiling, "keep_compiled", lambda: None)
+def test_monte_carlo_of_a_described_network(tmp_path, capsys):
     scene, out = tmp_path / "scene.toml", tmp_path / "trials"
     scene.write_text('layout = "ring"\nstations = 4\nobserve = "links"\n')
     asked = ["montecarlo", str(scene), "--trials", "300", "--batch", "100", "--out", str(out)]

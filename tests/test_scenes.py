@@ -458,8 +458,7 @@ def test_examples_come_with_the_package():
         read_description("shib")
 
 
-def test_simulate_writes_recording_and_truth_apart(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(jaxvm.solve.compiling, "keep_compiled", lambda: None)
+def test_simulate_writes_recording_and_truth_apart(tmp_path, capsys):
     folder = tmp_path / "bridge"
     assert main(["simulate", "chain", "--out", str(folder), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
@@ -476,8 +475,7 @@ def test_simulate_writes_recording_and_truth_apart(tmp_path, capsys, monkeypatch
     assert not (tmp_path / "new").exists()
 
 
-def test_simulate_takes_a_file(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(jaxvm.solve.compiling, "keep_compiled", lambda: None)
+def test_simulate_takes_a_file(tmp_path, capsys):
     file = tmp_path / "mine.toml"
     file.write_text(SMALL["chain of links"])
     out, truth = tmp_path / "mine", tmp_path / "key"

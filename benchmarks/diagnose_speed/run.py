@@ -21,7 +21,6 @@ from world import record  # noqa: E402
 
 from jaxvm.discover import diagnose  # noqa: E402
 from jaxvm.recording import read_recording  # noqa: E402
-from jaxvm.solve.compiling import keep_compiled  # noqa: E402
 
 HIDDEN = (
     (),
@@ -36,7 +35,6 @@ HIDDEN = (
 
 
 def main() -> None:
-    keep_compiled()
     rows = []
     with tempfile.TemporaryDirectory() as work:
         for number, hidden in enumerate(HIDDEN):

@@ -22,7 +22,6 @@ from scipy.optimize import least_squares
 from jaxvm.discover import diagnose
 from jaxvm.recording import find_data, read_recording
 from jaxvm.report import summary, write_report
-from jaxvm.solve.compiling import keep_compiled
 
 HERE = Path(__file__).parent
 ROWS, COLUMNS, SPACING_M = 6, 9, 0.025
@@ -124,7 +123,6 @@ def main() -> None:
     if data is None:
         print("opencv-stereo is not here; set JAXVM_DATA to the folder that has it")
         sys.exit(0)
-    keep_compiled()
     pairs = corners(data)
     with tempfile.TemporaryDirectory() as folder:
         write_recording(pairs, Path(folder))

@@ -22,7 +22,7 @@ import meshes
 import stations
 from intervals import RESAMPLES
 
-from jaxvm.solve.compiling import compile_seconds, keep_compiled
+from jaxvm.solve.compiling import compile_seconds
 
 HERE = Path(__file__).parent
 
@@ -96,7 +96,6 @@ def main() -> None:
     options = parser.parse_args()
     out = options.out or (HERE / "report" if options.quick else HERE)
     out.mkdir(parents=True, exist_ok=True)
-    keep_compiled()
     file, studies = out / "results.json", QUICK if options.quick else FULL
     results = {"quick": options.quick, "jax": jax.__version__, "seconds": {}}
     if options.only or options.again:

@@ -51,9 +51,8 @@ def show(folder: Path, entry: dict) -> dict:
     from power import shown
 
     from jaxvm.recording import read_recording
-    from jaxvm.solve.compiling import forget_compiled_if_many, keep_compiled
+    from jaxvm.solve.compiling import forget_compiled_if_many
 
-    keep_compiled()
     forget_compiled_if_many()
     recording = read_recording(folder / "recordings" / entry["id"])
     return shown(recording, *sealed_changes(folder, entry), entry["noise"]).as_dict()

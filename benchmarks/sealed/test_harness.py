@@ -13,13 +13,11 @@ from tally import wilson
 from jaxvm.discover.cells import arrange
 from jaxvm.recording import read_recording
 from jaxvm.simulate import simulate_deformation_scene
-from jaxvm.solve.compiling import keep_compiled
 
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
     """A small recording, and the change that its hidden slip makes."""
-    keep_compiled()
     folder = tmp_path_factory.mktemp("small")
     made = {}
     for name, hide in (("plain", ()), ("slip", ("mount-slip",))):

@@ -1,11 +1,9 @@
-"""Compilation: how long XLA has been at it in this process, and programs that stay on disk."""
+"""Compilation: how long XLA has been at it in this process, and forgetting its programs."""
 
-import os
 from pathlib import Path
 
 import jax
 import jax.monitoring
-from platformdirs import user_cache_path
 
 _total = 0.0
 
@@ -22,18 +20,6 @@ jax.monitoring.register_event_duration_secs_listener(_listen)
 def compile_seconds() -> float:
     """Seconds spent compiling since the package was imported."""
     return _total
-
-
-def keep_compiled() -> None:
-    """Keep compiled programs on disk (the user's cache folder): a second run starts at once.
-
-    An environment variable JAX_COMPILATION_CACHE_DIR names another folder.
-    """
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        folder = user_cache_path("jaxvm") / f"compiled-{jax.__version__}"
-        jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
 _MAPS, _MOST_MAPS = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
