@@ -1,6 +1,8 @@
 """Blocks of images: the Schur complement against the dense arrow, and a peer's optimum."""
 
+import importlib.util
 from dataclasses import replace
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,8 +12,9 @@ from networks import free_points_recording
 from jaxvm.network.scene import build
 from jaxvm.recording import RecordingError, find_data
 from jaxvm.recording.bal import import_bal, write_bal
-from jaxvm.solve import large
+from jaxvm.solve import large, schur, schur_pattern
 from jaxvm.solve.adjust import adjust
+from jaxvm.solve.buckets import CORES
 from jaxvm.solve.problem import normal_at, scaled, scene_problem
 from jaxvm.solve.robust import HuberLoss, SquaredLoss
 from jaxvm.solve.schur import SchurFactors, schur_normal
@@ -103,17 +106,67 @@ def test_steps_are_those_of_the_dense_arrow(scene, which, loss, reduced):
     np.testing.assert_allclose(again, found, rtol=1e-7, atol=1e-9 * np.abs(found).max())
 
 
-def test_adjustments_end_at_the_same_cost(scene, monkeypatch):
+@pytest.mark.parametrize("reduced", ["dense", "sparse"])
+def test_adjustments_end_at_the_same_cost(scene, monkeypatch, reduced):
     options = dict(check=False, damping=1e-4, rtol=1e-12)
     dense = adjust(scene, **options)
     monkeypatch.setattr(large, "_WIDE", 0)
+    if reduced == "sparse":
+        monkeypatch.setattr(large, "_DENSE", 10)
+        monkeypatch.setattr(large, "_MOSTLY_LOCAL", 0.0)
     monkeypatch.setattr(SchurPattern.of.__func__, "__defaults__", (np.inf, True))
     problem = scene_problem(scene)
-    assert isinstance(large.prepared(problem)[2], SchurFactors)
+    prepared = large.prepared(problem)
+    assert isinstance(prepared[2], SchurFactors)
+    assert prepared[1].pattern.triangle.dense == (reduced == "dense")
     found = adjust(scene, **options)
     assert found.converged and dense.converged
     assert found.cost == pytest.approx(dense.cost, rel=1e-9)
     assert found.cost < 0.05 * found.cost_before
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory):
+    """A simulated block of the benchmark, made by its own formulas: true and at its start."""
+    place = Path(__file__).parents[1] / "benchmarks" / "bundle_adjustment" / "simulated.py"
+    spec = importlib.util.spec_from_file_location("simulated_blocks", place)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    folder = tmp_path_factory.mktemp("simulated")
+    camera, point, pixel, cameras, points = module.block(16, 4000, 4.0, 3)
+    write_bal(folder / "true.txt", camera, point, pixel, cameras, points)
+    module.write(folder / "start.txt", 16, 4000, 4.0, 3)
+    return {name: build(import_bal(folder / f"{name}.txt")) for name in ("true", "start")}
+
+
+def test_a_simulated_block_has_the_noise_that_it_was_given(simulated):
+    problem = scene_problem(simulated["true"])
+    pixel = simulated["true"].recording.observations.pixel
+    chi_square = 2.0 * float(problem.cost(jnp.zeros(problem.n))) / 0.5**2
+    # Pixels are true to half a pixel; chi-square of 2 n values within five standard deviations.
+    assert abs(chi_square - pixel.size) < 5.0 * np.sqrt(2.0 * pixel.size)
+    seen = np.bincount(simulated["true"].recording.observations.point, minlength=4000)
+    assert seen.min() >= 2 and seen.mean() == pytest.approx(4.0, rel=0.3)
+
+
+def test_a_table_of_several_pieces_and_shares(simulated, monkeypatch):
+    """Normal equations and steps of the dense arrow again, on 16,000 rows at the start."""
+    monkeypatch.setattr(schur_pattern, "_SHARE", 1000)
+    problem = scene_problem(simulated["start"])
+    problem, dense = scaled(problem, normal_at(problem, jnp.zeros(problem.n)))
+    pattern = SchurPattern.of(problem, share=np.inf)
+    assert len(pattern.pairs) == CORES
+    assert pattern.views[0].own.size >= 2 * schur._PIECE
+    normal = schur_normal(problem, pattern, jnp.zeros(problem.n))
+    assert normal.cost == pytest.approx(float(dense.cost), rel=1e-11)
+    np.testing.assert_allclose(normal.diagonal(), dense.hessian.diagonal(), rtol=1e-9)
+    scale = np.abs(dense.gradient).max()
+    np.testing.assert_allclose(normal.gradient, dense.gradient, atol=1e-10 * scale)
+    factors = SchurFactors(pattern)
+    assert factors.factorise(normal, 1e-2)
+    step = np.asarray(factors.solve(normal.gradient))
+    damped = dense.hessian.mv(jnp.asarray(step)) + 1e-2 * dense.hessian.diagonal() * step
+    np.testing.assert_allclose(damped, dense.gradient, atol=1e-8 * scale)
 
 
 def test_an_indefinite_matrix_is_no_step(scene):

@@ -18,7 +18,6 @@ from world import Made, draw_world, record
 from jaxvm.identify import identify
 from jaxvm.identify.maps import drift_map, settled_after
 from jaxvm.recording import Recording, read_recording
-from jaxvm.solve.compiling import keep_compiled
 
 HERE = Path(__file__).parent
 SEEDS = range(5)
@@ -44,7 +43,6 @@ def main() -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    keep_compiled()
     drawn, axes = plt.subplots(2, 3, figsize=(11.0, 6.0), layout="constrained")
     results = []
     for column, (name, history) in enumerate(EXPERIMENTS.items()):

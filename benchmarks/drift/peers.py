@@ -24,7 +24,6 @@ from jaxvm.identify.inputs import inputs_of
 from jaxvm.identify.model import CameraDrift
 from jaxvm.physics.drivers import POWER_ON
 from jaxvm.recording import read_recording
-from jaxvm.solve.compiling import keep_compiled
 
 HERE = Path(__file__).parent
 
@@ -115,7 +114,6 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=8)
     parser.add_argument("--first", type=int, default=3000)
     options = parser.parse_args()
-    keep_compiled()
     rows = []
     for family in FAMILIES:
         for seed in range(options.first, options.first + options.count):

@@ -47,10 +47,9 @@ def one(task: tuple[str, int]) -> dict:
     from jaxvm.identify import compensate, identify
     from jaxvm.identify.identify import CONTINUOUS, DISCRETE
     from jaxvm.recording import read_recording
-    from jaxvm.solve.compiling import forget_compiled_if_many, keep_compiled
+    from jaxvm.solve.compiling import forget_compiled_if_many
 
     family, seed = task
-    keep_compiled()
     forget_compiled_if_many()
     train, test = pair(seed, family)
     with tempfile.TemporaryDirectory() as place:

@@ -18,7 +18,6 @@ from matplotlib.figure import Figure
 from jaxvm.discover import diagnose
 from jaxvm.recording import read_recording
 from jaxvm.simulate import HIDEABLE, simulate_deformation_scene
-from jaxvm.solve.compiling import keep_compiled
 
 HERE = Path(__file__).parent
 
@@ -79,7 +78,6 @@ def one(hide, seed: int) -> dict:
 def main() -> None:
     n_seeds = int(sys.argv[1]) if len(sys.argv) > 1 else 3
     n_empty = int(sys.argv[2]) if len(sys.argv) > 2 else 20
-    keep_compiled()
     rows = []
     for seed in range(101, 101 + n_seeds):
         for hide in HIDEABLE:

@@ -45,9 +45,7 @@ def one(n: int, repeats: int) -> dict:
     from jaxvm.network.start import start
     from jaxvm.scenes import read_description, simulate_network
     from jaxvm.solve.adjust import adjust
-    from jaxvm.solve.compiling import keep_compiled
 
-    keep_compiled()
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "scene.toml"
         file.write_text(SCENE.format(n=n))

@@ -62,9 +62,7 @@ def one(epochs: int, wanted: list[int]) -> dict:
     from jaxvm.simulate import scene as world
     from jaxvm.simulate import simulate_deformation_scene
     from jaxvm.solve.adjust import adjust
-    from jaxvm.solve.compiling import keep_compiled
 
-    keep_compiled()
     world.EXTENTS["asked"] = world.Extent(epochs, 300.0 * 97 / epochs, 6)
     with tempfile.TemporaryDirectory() as place:
         made = simulate_deformation_scene((), seed=5, size="asked")

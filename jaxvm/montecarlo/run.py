@@ -1,5 +1,6 @@
 """Running a study: batches, devices, a folder that a run is resumed from, progress."""
 
+import json
 import os
 import time
 from collections import deque
@@ -26,6 +27,10 @@ from jaxvm.solve.compiling import compile_seconds
 _FLUSH_SECONDS, _FLUSH_SHARE = 1.0, 0.02
 """Trials are written after a second, later on after a fiftieth of the time that has gone by: so
 much work a kill may cost, and a long run has some hundred files."""
+
+
+_SIZES: dict[str, int] = {}
+"""Sizes of batches that this process has found, by what studies say of themselves."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +82,7 @@ def run(
         trials: how many.
         folder: where trials are written; a run that was stopped or killed there goes on. Without
             it they stay in memory.
-        batch: trials at a time; found by measuring if not given.
+        batch: trials at a time; found by measuring if not given, once for a study in a process.
         mesh: devices to share trials out to, one axis `trials`; all there are by default.
         progress: told after each batch.
         stop: asked after each batch whether to stop. An interruption (Ctrl-C) stops, too; what is
@@ -101,7 +106,11 @@ def run(
     store = Store(folder, about) if folder is not None and first else None
     gathered = _Gathered(store, trials)
     left = np.flatnonzero(~_agreed(gathered.there))
-    batch = getattr(study, "together", None) if batch is None else batch
+    told = json.dumps([study.about(), 1 if mesh is None else mesh.size], default=str)
+    known = _SIZES.get(told, len(left) + 1)
+    if batch is None:
+        batch = getattr(study, "together", known if known <= len(left) else None)
+    measured = batch is None
     pace = Pace(batch, 1 if mesh is None else mesh.size, len(left))
     # A processor works at several batches at a time: none keeps all of its cores busy.
     cores = os.cpu_count() or 1 if mesh is None and isinstance(study, Traced) and _on_host() else 1
@@ -137,6 +146,8 @@ def run(
     finally:
         pool.shutdown(cancel_futures=True)
         gathered.flush()
+    if measured and pace.found:
+        _SIZES[told] = pace.batch
     return Results(
         names=gathered.names,
         statistics=gathered.statistics,

@@ -27,7 +27,7 @@ def componentwise(function: Callable, *args, axes: int) -> Any:
     """`function`, vmapped over the leading axes of its arguments, as numbers.
 
     Args:
-        function: of one row; pure.
+        function: of one row; pure, with no traced array in its closure.
         args: PyTrees of arrays; their leading `axes` axes broadcast against each other, so what
             many rows share has length 1 there.
         axes: how many axes count rows.
