@@ -43,7 +43,7 @@ import jax  # noqa: E402
 from platformdirs import user_cache_path  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
-if jax.config.jax_compilation_cache_dir is None:
+if jax.config.values["jax_compilation_cache_dir"] is None:
     _folder = user_cache_path("jaxvm") / f"compiled-{jax.__version__}"
     jax.config.update("jax_compilation_cache_dir", str(_folder))
 if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:

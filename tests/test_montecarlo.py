@@ -1,5 +1,6 @@
 """Monte Carlo: statistics against NumPy, any batch and device, stopped and killed and resumed."""
 
+import importlib
 import signal
 import time
 
@@ -415,6 +416,21 @@ def test_trials_go_to_one_file(tmp_path, scene):
 def test_fewer_than_one_trial_is_refused(scene):
     with pytest.raises(ValueError, match="at least one trial"):
         run(network_study(scene, last), 0, 0)
+
+
+def test_the_size_of_batches_is_found_once(scene, monkeypatch):
+    """The next run of a study begins with the size that was found, a short one does not."""
+    sizes = importlib.import_module("jaxvm.montecarlo.run")._SIZES
+    sizes.clear()
+    study = network_study(scene, last)
+    first = run(study, 1, 600)
+    (asked,) = sizes
+    assert sizes[asked] == first.batch
+    sizes[asked] = 100
+    told = []
+    run(study, 1, 600, progress=told.append)
+    assert {progress.batch for progress in told} == {100}
+    assert run(study, 1, 50).batch == 50
 
 
 def test_the_pace_grows_while_that_pays():

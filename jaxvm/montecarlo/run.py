@@ -106,8 +106,8 @@ def run(
     store = Store(folder, about) if folder is not None and first else None
     gathered = _Gathered(store, trials)
     left = np.flatnonzero(~_agreed(gathered.there))
-    told = json.dumps([study.about(), 1 if mesh is None else mesh.size], default=str)
-    known = _SIZES.get(told, len(left) + 1)
+    asked = json.dumps([study.about(), 1 if mesh is None else mesh.size], default=str)
+    known = _SIZES.get(asked, len(left) + 1)
     if batch is None:
         batch = getattr(study, "together", known if known <= len(left) else None)
     measured = batch is None
@@ -147,7 +147,7 @@ def run(
         pool.shutdown(cancel_futures=True)
         gathered.flush()
     if measured and pace.found:
-        _SIZES[told] = pace.batch
+        _SIZES[asked] = pace.batch
     return Results(
         names=gathered.names,
         statistics=gathered.statistics,

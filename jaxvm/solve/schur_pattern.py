@@ -345,7 +345,7 @@ def _pairs_in_groups(group, n_groups: int):
     count = np.bincount(group[used], minlength=n_groups)
     first = np.cumsum(count) - count
     left, right = [np.zeros(0, int)], [np.zeros(0, int)]
-    for size in np.flatnonzero(np.bincount(count[count > 0])):
+    for size in map(int, np.flatnonzero(np.bincount(count[count > 0]))):
         start = first[count == size]
         a, b = np.triu_indices(size)
         left.append(member[(start[:, None] + a).ravel()])
