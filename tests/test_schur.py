@@ -14,7 +14,7 @@ from jaxvm.recording import RecordingError, find_data
 from jaxvm.recording.bal import import_bal, write_bal
 from jaxvm.solve import large, schur, schur_pattern
 from jaxvm.solve.adjust import adjust
-from jaxvm.solve.buckets import CORES
+from jaxvm.solve.buckets import CORES, Products
 from jaxvm.solve.problem import normal_at, scaled, scene_problem
 from jaxvm.solve.robust import HuberLoss, SquaredLoss
 from jaxvm.solve.schur import SchurFactors, schur_normal
@@ -167,6 +167,16 @@ def test_a_table_of_several_pieces_and_shares(simulated, monkeypatch):
     step = np.asarray(factors.solve(normal.gradient))
     damped = dense.hessian.mv(jnp.asarray(step)) + 1e-2 * dense.hessian.diagonal() * step
     np.testing.assert_allclose(damped, dense.gradient, atol=1e-8 * scale)
+
+
+def test_a_long_list_is_not_filled_up_with_empty_ones():
+    """One pair of views that has more points in common than a piece holds."""
+    n, each = 5000, np.arange(5000)
+    products = Products.of(np.zeros(n, int), 1, each, each, n)
+    assert [left.shape for left in products.left] == [(1, 1, n)]
+    values = jnp.asarray(np.random.default_rng(0).normal(size=(n, 3, 2)))
+    expected = np.einsum("nia,nib->ab", values, values)
+    np.testing.assert_allclose(products(values)[0], expected, rtol=1e-11)
 
 
 def test_an_indefinite_matrix_is_no_step(scene):

@@ -76,10 +76,9 @@ def joined(numbers: Numbers, rows: tuple[int, ...], axis: int) -> Array:
 
 # --- running a program ---------------------------------------------------------------------------
 
-_CALLS = {"jit", "pjit", "closed_call", "core_call", "remat", "checkpoint"} | {
-    "custom_jvp_call",
-    "custom_vjp_call",
-}
+_CALLS = set(
+    "jit pjit closed_call core_call remat checkpoint custom_jvp_call custom_vjp_call".split()
+)
 
 
 def _run(jaxpr, consts, args: list[Numbers]) -> list[Numbers]:
@@ -177,11 +176,12 @@ def _array(numbers: Numbers, variable) -> Array:
 
 
 def is_known(x) -> bool:
+    """Whether a number is known while the program is traced."""
     return isinstance(x, np.generic)
 
 
 def _is(x, value: float) -> bool:
-    return isinstance(x, np.generic) and bool(x == value)
+    return is_known(x) and bool(x == value)
 
 
 def each(function: Callable, *inputs: Numbers) -> Numbers:

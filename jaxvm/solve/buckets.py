@@ -109,7 +109,8 @@ class Products(eqx.Module):
         found, first = ([], [], []), 0
         for rows in map(np.asarray, buckets.rows):
             count, width = rows.shape
-            pieces = -(-count * width // _MEMBERS)
+            # A list that is longer than a piece is one on its own.
+            pieces = min(-(-count * width // _MEMBERS), count)
             together = -(-count // pieces)
             spare = pieces * together - count
             rows = np.pad(rows, ((0, spare), (0, 0)), constant_values=len(owner))

@@ -1,7 +1,7 @@
 """Gauss-Newton and Levenberg-Marquardt for large networks: a loop on the host about CHOLMOD.
 
-The rules are those of `jaxvm.solve.optimise`: relative damping of a unit diagonal, a trust region
-that opens fast, and a statistical stop.
+As in `jaxvm.solve.optimise` damping is relative to a unit diagonal and the stop is statistical; how
+damping changes differs (`_changed`), for here every step counts.
 """
 
 import time
