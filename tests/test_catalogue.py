@@ -59,7 +59,7 @@ def test_identifiers_are_unique_and_many():
     assert len(BY_ID) == len(CATALOGUE) >= 65
 
 
-MIXED = {"radial-beyond-model", "sensor-tilt"}
+MIXED = {"aspect", "radial-beyond-model", "sensor-tilt"}
 """Entries whose ports have several units."""
 
 
@@ -118,8 +118,6 @@ ALIKE = (
     {"window-lens-power", "focal-sun"},
     # Both are a delay from one moment on.
     {"frame-slip", "trigger-late"},
-    # A wedge turns all rays as a turn of the camera does.
-    {"mount-slip", "window-refitted"},
     # Sunlight heats the housing and brightens one side of the marks.
     {"principal-point-sun", "light-bias"},
     # A longer exposure heats the sensor and lets bright marks bloom.

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from jaxvm.geometry import lens_family
 from jaxvm.physics.chain import (
@@ -347,6 +348,24 @@ def _():
         yield Case(0.05, seen(X + 0.4 * 0.05 * share, Y, Z), moving)
 
 
+@hand("target.disc", "m²")
+def _():
+    # The rim of a disc of radius 4 cm on a leaning plate, projected: the middle of that ellipse.
+    radius = 0.04
+    angle = 2.0 * np.pi * np.arange(360) / 360
+    rim = radius * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
+    for turn in ((0.0, 0.0, 0.0), (0.6, 0.0, 0.0), (0.0, -0.8, 0.0)):
+        for x, y in ((0.0, 0.0), (1.5, -1.0)):
+            at = np.array([x, y, Z]) + rim @ Rotation.from_rotvec(turn).as_matrix().T
+            image = (at[:, :2] / at[:, 2:] - [x / Z, y / Z]) * Z / radius
+            conic = np.column_stack([image**2, image[:, 0] * image[:, 1], image])
+            a, b, c, d, e = np.linalg.lstsq(conic, np.ones(360), rcond=None)[0]
+            off = np.linalg.solve([[2.0 * a, c], [c, 2.0 * b]], [-d, -e])
+            middle = seen(x, y, Z) + F * off * radius / Z
+            leaning = Bench(origin=(x, y, Z), point=(0, 0, 0), target_turn=turn)
+            yield Case(radius**2, middle, leaning, rtol=2e-3)
+
+
 @hand("medium.bend_u", "rad/m")
 def _():
     # On the axis L = Z: k L^2 / 2 = 25 mm for k = 2e-5 at 50 m, that is k Z F / 2 = 1 px.
@@ -379,6 +398,30 @@ def _():
         # The chain takes the angle of the line to the mark for the ray's: equal to first order
         # in d, and to d/Z = 2e-4 of the effect here.
         yield Case(d, expected, Bench(origin=(x, y, Z), point=(0, 0, 0)), rtol=3e-4)
+
+
+@hand("medium.wedge_x", "rad")
+def _():
+    yield from through_wedge(np.array([1.0, 0.0]))
+
+
+@hand("medium.wedge_y", "rad")
+def _():
+    yield from through_wedge(np.array([0.0, 1.0]))
+
+
+def through_wedge(side):
+    # From the pinhole through a thin plate of n = 1.52: its near face is normal to the axis, its
+    # far face leans by w. Snell's law in vectors gives where the ray of an image point goes.
+    w, n = 1e-4, 1.52
+    for x, y in ((0.0, 0.0), (0.3, -0.2), (-0.5, 0.6)):
+        aim = np.array([x, y, 1.0]) / np.sqrt(1.0 + x * x + y * y)
+        glass = np.append(aim[:2] / n, np.sqrt(1.0 - aim[:2] @ aim[:2] / n**2))
+        face = np.append(np.sin(w) * side, np.cos(w))
+        inside = glass @ face
+        out = n * glass + (np.sqrt(1.0 - n**2 * (1.0 - inside**2)) - n * inside) * face
+        mark = tuple(Z * out / out[2])
+        yield Case(w, (CX + F * x, CY + F * y), Bench(origin=mark, point=(0, 0, 0)), rtol=1e-3)
 
 
 # The body turns, so what it sees turns the other way. Distances are those in the body's axes.

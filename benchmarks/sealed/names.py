@@ -5,7 +5,7 @@ hysteresis) say how an effect follows its driver, not which effect it is.
 """
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 MODIFIERS = frozenset(range(76, 86))
 
@@ -20,6 +20,7 @@ class Facts:
         spacing_s: median spacing of the epochs (s).
         first_s: time of the first epoch (s), from which reports count.
         rolled: whether any camera sees a target in attitudes that differ in roll by over 10 deg.
+        seers: the cameras that see each target.
     """
 
     names: dict[str, tuple[str, ...]]
@@ -27,6 +28,7 @@ class Facts:
     spacing_s: float
     first_s: float
     rolled: bool
+    seers: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     def alone(self, station: str) -> bool:
         """Whether a station carries one camera only."""
@@ -118,6 +120,11 @@ def same_place(hidden: dict, where: dict[str, list[str]], facts: Facts) -> bool:
         return all(set(names) == set(facts.names[kind]) for kind, names in given.items())
     if set(true) == set(where):
         return all(set(true[kind]) == set(where[kind]) for kind in true)
+    # A target, and the target as the only cameras see it that do, are the same observations.
+    if set(true) | set(where) == {"camera", "target"} and "target" in true and "target" in where:
+        cameras = set(true.get("camera", ())) | set(where.get("camera", ()))
+        sees = {camera for target in true["target"] for camera in facts.seers.get(target, ())}
+        return set(true["target"]) == set(where["target"]) and cameras == sees
     # All cameras of a station and the station are one place (chain of rigid frames).
     if set(true) | set(where) == {"camera", "station"}:
         return _cameras(true, facts) == _cameras(where, facts)

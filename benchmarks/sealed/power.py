@@ -240,7 +240,17 @@ def facts_of(scene: Scene) -> Facts:
     names = {k: tuple(b.name for b in own) for k, own in zip(kinds, bodies, strict=True)}
     station_of = {body.name: body.station for body in (*model.cameras, *model.rangefinders)}
     spacing = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
-    return Facts(names, station_of, spacing, float(time[0]), rolled(scene))
+    return Facts(names, station_of, spacing, float(time[0]), rolled(scene), seers(scene))
+
+
+def seers(scene: Scene) -> dict[str, tuple[str, ...]]:
+    """The cameras that see each target."""
+    model, obs = scene.model, scene.recording.observations
+    seen = np.unique(np.stack([obs.target, obs.camera], axis=1), axis=0)
+    return {
+        target.name: tuple(model.cameras[c].name for c in seen[seen[:, 0] == t, 1])
+        for t, target in enumerate(model.targets)
+    }
 
 
 def rolled(scene: Scene) -> bool:

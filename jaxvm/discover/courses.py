@@ -22,6 +22,9 @@ _MOST_INSTANTS = 60
 _RAMPS, _EVENTS = np.linspace(0.1, 0.8, 8), np.linspace(0.1, 0.7, 7)
 """Shares of the epochs before a ramp, or an event after which something settles."""
 
+_STAIRS = [(share, k / 8.0) for share in np.geomspace(0.1, 0.5, 20).tolist() for k in range(8)]
+"""Height of a stair as a share of a quantity's range, and where it begins: no refit moves them."""
+
 _MOST_OF_MARKS = 3000
 """Hypotheses about single marks; where marks and instants are many, fewer instants are asked."""
 
@@ -48,22 +51,40 @@ def driver_kind(scene: Scene, driver: str) -> str:
     return "time" if kind == "order" else kind
 
 
-def kinds_in_scope(
-    kind: str, driver: str, scope: Scope, channels: tuple[str, ...]
-) -> tuple[str, ...]:
+def kinds_in_scope(kind: str, driver: str, scope: Scope, scene: Scene) -> tuple[str, ...]:
     """Kinds of a driver for the bodies of a scope, general ones first.
 
-    The body of another camera is a neighbour. Where the camera's own body is logged, too, it is
-    nothing else: physics of a camera follows its own temperature, not one like it.
+    The body of a camera is a neighbour of other cameras, of stations that don't carry it, and of
+    targets. Where what is nearer is logged, too (a camera's own body, the air), it is nothing else:
+    physics of a body follows its own temperature, not one like it.
     """
     if kind not in ("quantity", "difference", "own"):
         return tuple(kind.split(" or "))
     own = channel_kind(driver)
-    body = driver.split(" - ")[0].removeprefix("body_").removesuffix("_degC")
-    if driver.startswith("body_") and len(scope.camera) == 1 and body not in scope.camera:
-        logged = f"body_{scope.camera[0]}_degC" in channels
-        return ("neighbour",) if logged else ("quantity", own, "neighbour")
-    return ("quantity", own)
+    body = _camera_of(driver)
+    if not body or scope == Scope() or scope.rangefinder:
+        return ("quantity", own)
+    if scope.target and kind == "difference":
+        return ("difference",)
+    if scope.target:
+        return ("neighbour",) if _air_is_logged(scene) else ("quantity", own, "neighbour")
+    stations = {camera.name: camera.station for camera in scene.model.cameras}
+    near = scope.camera or [name for name, at in stations.items() if at in scope.station]
+    if body in near:
+        return ("quantity", own)
+    logged = all(f"body_{name}_degC" in scene.network.channels.names for name in near)
+    return ("neighbour",) if logged else ("quantity", own, "neighbour")
+
+
+def _camera_of(driver: str) -> str:
+    """The camera whose body's temperature a driver is, alone or against the air's; or ""."""
+    name = driver.split(" - ")[0]
+    return name.removeprefix("body_").removesuffix("_degC") if name.startswith("body_") else ""
+
+
+def _air_is_logged(scene: Scene) -> bool:
+    channels = scene.network.channels.names
+    return any(channel_kind(c) == "temperature" and not _camera_of(c) for c in channels)
 
 
 def enumerate_courses(scene: Scene) -> list[Course]:
@@ -93,6 +114,7 @@ def courses_of_marks(courses: list[Course], n_marks: int) -> list[Course]:
         and channel_kind(course.driver) == "temperature"
         and course.driver != OWN_BODY  # a mark belongs to no camera
     ]
+    warm = [course for course in warm if not _camera_of(course.driver)] or warm
     every = math.ceil(max(n_marks * sum(map(len, slow)) / _MOST_OF_MARKS, 1.0))
     return [courses[0], *warm, *(course for own in slow for course in own[::every])]
 
@@ -129,8 +151,7 @@ def _of_quantity(driver: str, channels: Channels, lags: list[float]) -> list[Cou
         *(Course(driver, "turning", (times * span,), reference) for times in (4.0, 7.0, 15.0)),
         *(
             Course(driver, "staircase", (share * width, phase), reference)
-            for share in (0.12, 0.17, 0.22, 0.28, 0.36, 0.45)
-            for phase in (0.0, 0.5)
+            for share, phase in _STAIRS
         ),
         *_hysteresis(driver, width, reference),
     ]

@@ -98,4 +98,5 @@ def is_patterned(group: Group) -> bool:
 def entity_of(port: str) -> str:
     """Kind of entity that has a port."""
     # A window belongs to its camera, the air to all cameras of a station alike.
-    return "camera" if port == "medium.window" else _ENTITY_OF_STAGE[_STAGE[port]]
+    glass = port.startswith(("medium.window", "medium.wedge"))
+    return "camera" if glass else _ENTITY_OF_STAGE[_STAGE[port]]

@@ -223,7 +223,7 @@ def enumerate_hypotheses(scene: Scene) -> tuple[Family, ...]:
     courses = enumerate_courses(scene)
     kinds = {
         course.driver: kinds_in_scope(
-            driver_kind(scene, course.driver), course.driver, Scope(), scene.network.channels.names
+            driver_kind(scene, course.driver), course.driver, Scope(), scene
         )
         for course in courses
     }
@@ -278,8 +278,7 @@ def member(family: Family, index: tuple[int, int, int], scene: Scene) -> Hypothe
     if group.mark is not None:
         target = scene.model.targets[group.mark[0]]
         scope = Scope(target=(target.name,), point=(target.point_names[group.mark[1]],))
-    channels = scene.network.channels.names
-    kinds = kinds_in_scope(family.kinds[index[1]], course.driver, scope, channels)
+    kinds = kinds_in_scope(family.kinds[index[1]], course.driver, scope, scene)
     entries = entries_for(group.terms, group.entity, kinds, course.form)
     each = len(family.groups) if group.mark is not None else 1
     asked = {entry.id: each * family.named[entry.id] * _variants(entry, group) for entry in entries}

@@ -117,13 +117,18 @@ def surprise(
     return 2.0 * (x - (half - 1.0) * np.log(x) + gammaln(half))
 
 
-def top(ranking: Ranking, scene: Scene, count: int) -> list[tuple[Hypothesis, float, np.ndarray]]:
+def top(
+    ranking: Ranking, scene: Scene, count: int, columns: int | None = None
+) -> list[tuple[Hypothesis, float, np.ndarray]]:
     """The leading hypotheses by z: (hypothesis, drop, one-step amplitudes).
 
+    With at most so many `columns`, where that is given.
     Courses that differ only in their constants (instants, lags, periods) count as one: the best.
     """
     entries = []
     for scores in ranking.scores:
+        if columns is not None and scores.amplitude.shape[-1] > columns:
+            continue
         z = np.where(scores.valid, scores.z, -np.inf)
         drop = scores.family.at_peaks(np.where(scores.valid, scores.drop, -np.inf))
         best = scores.family.with_best_constants(z)

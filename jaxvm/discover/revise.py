@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxvm.discover.diagnosis import Finding
 from jaxvm.discover.hypotheses import Hypothesis
-from jaxvm.discover.select import evidence, price_of_columns
+from jaxvm.discover.select import price, price_of_columns
 from jaxvm.network.scene import Scene
 from jaxvm.physics.forms import FORMS
 from jaxvm.solve.adjust import Adjustment
@@ -100,11 +100,9 @@ def _with_effects(findings: list[Finding], fitted: Adjustment) -> list[Finding]:
 
 
 def _complexity(findings: list[Finding], variance: float, n: int) -> float:
-    """What the findings cost: columns, constants, implausibility (on the scale of chi-square)."""
+    """What the findings cost together."""
     return sum(
-        f.drop / variance
-        - evidence(f.hypothesis, f.drop, np.asarray(f.effect.amplitudes), variance, n)
-        for f in findings
+        price(f.hypothesis, f.drop, np.asarray(f.effect.amplitudes), variance, n) for f in findings
     )
 
 

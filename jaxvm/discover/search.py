@@ -8,9 +8,10 @@ import numpy as np
 from jaxvm.discover.accept import Accepted, accept, short
 from jaxvm.discover.detail import with_detail
 from jaxvm.discover.diagnosis import Finding
-from jaxvm.discover.heldout import HeldOut, Split
+from jaxvm.discover.heldout import HeldOut, Split, gain
 from jaxvm.discover.hypotheses import FREE, Hypothesis, enumerate_hypotheses
 from jaxvm.discover.noise import LONGEST, memory, multipliers
+from jaxvm.discover.pairs import better_pair, of_other_places, worth_a_second_thought
 from jaxvm.discover.ranking import Ranking, noise_of, spread_of_constant, surprise
 from jaxvm.discover.revise import lost_without, prune, rename
 from jaxvm.discover.rivals import rivals
@@ -18,6 +19,7 @@ from jaxvm.discover.scatter import ALIKE, likeness, of_each_image
 from jaxvm.discover.score import ScoreTests
 from jaxvm.discover.select import Candidate, identity, refit, shortlist, stacked
 from jaxvm.discover.waves import strongest_wave
+from jaxvm.physics.effects import Effect
 from jaxvm.physics.forms import FORMS
 from jaxvm.solve.adjust import Adjustment
 from jaxvm.solve.covariance import effect_deviations
@@ -84,6 +86,23 @@ class Search:
 
     def run(self, most: int, progress: Callable[[str], None]) -> None:
         """Search until nothing significant is left, at most so many findings are made."""
+        plain, heldout = self.current, self.heldout
+        first = self._search(most, progress)
+        if worth_a_second_thought(self.findings):
+            progress("trying pairs of other effects")
+            others = of_other_places(first, plain, self.findings[0].hypothesis, self.parts.n)
+            pair = better_pair(plain, self.current, self.findings, others, self._tests, self.parts)
+            if pair is not None and self._as_good_on_heldout(pair[1]):
+                self.current, self.heldout, self.findings = plain, heldout, []
+                self._hopeless, self._superfluous = set(), set()
+                for candidate in pair:
+                    self._take_as_given(candidate, progress)
+                self._search(most, progress)
+        self._settle()
+
+    def _search(self, most: int, progress: Callable[[str], None]) -> Ranking:
+        """Take one effect after the other; returns the first scores."""
+        first = None
         for _ in range(3 * most + 1):
             progress(f"scoring hypotheses (round {len(self.findings) + 1})")
             leading = [
@@ -91,6 +110,7 @@ class Search:
                 for item in self._score()
                 if not any(item[0].covered(f.hypothesis) for f in self.findings)
             ]
+            first = first or self.ranking
             if len(self.findings) == most:
                 break
             accepted = self._accepted(leading, progress)
@@ -103,12 +123,11 @@ class Search:
                     self.p_value = min(scored, self.p_value)
                     break
             self.unproven = ""
-            effect = accepted.chosen.effect
-            self._take(accepted, leading)
+            effect = self._take(accepted, leading)
             progress(f"found: {effect.name} ({effect.scope.words()})")
             if len(self.findings) > 1 and min(f.p_value for f in self.findings[-2:]) > self.alpha:
                 break
-        self._settle()
+        return first or self.ranking
 
     def _score(self):
         """Score all hypotheses; the leading ones."""
@@ -177,10 +196,14 @@ class Search:
         fitted = refit(self.current, hypothesis, amplitudes, self.parts)
         return None if fitted is None else stacked(fitted.adjustment)
 
-    def _take(self, accepted: Accepted, leading) -> None:
+    def _take(self, accepted: Accepted, leading) -> Effect:
         """Take an accepted hypothesis into the model, and look at the earlier findings again."""
         parts = self.parts
         finding = self._finding(accepted, leading)
+        named = self._named(accepted, finding)
+        if named is not None:
+            accepted, leading = named, [_item(named), *leading]
+            finding = self._finding(accepted, leading)
         former = [*self.findings, finding]
         self.heldout = accepted.heldout
         current = replace(accepted.chosen.adjustment, scene=accepted.heldout.scene)
@@ -195,6 +218,40 @@ class Search:
         # What did not help before may help beside the new one.
         self._hopeless = set(self._superfluous)
         self.findings = self._confirmed()
+        return accepted.chosen.effect
+
+    def _named(self, accepted: Accepted, finding: Finding) -> Accepted | None:
+        """A name that outweighs what has none, in its place; None where there is none."""
+        heavier = [r for r in finding.rivals if r.hypothesis.entries and r.weight > finding.weight]
+        if finding.hypothesis.entries or not heavier:
+            return None
+        other = heavier[0].hypothesis
+        columns = len(other.group.terms) * len(FORMS[other.course.form].bases)
+        again = refit(self.current, other, np.zeros(columns), self.parts)
+        if again is None:
+            return None
+        shown = self.parts.evaluate(again.adjustment.scene)
+        if shown.rms_px > _WORSE * accepted.heldout.rms_px:
+            return None
+        proof = gain(self.heldout, shown, self.seed)
+        return Accepted(again, (accepted.chosen,), shown, proof, (*accepted.tried, again))
+
+    def _as_good_on_heldout(self, candidate: Candidate) -> bool:
+        shown = self.parts.evaluate(candidate.adjustment.scene)
+        return shown.rms_px <= _WORSE * self.heldout.rms_px
+
+    def _take_as_given(self, candidate: Candidate, progress: Callable[[str], None]) -> None:
+        """Take a hypothesis that was chosen already, as if it had led."""
+        leading = [item for item in self._score() if not item[0].same(candidate.hypothesis)]
+        amplitudes = np.asarray(candidate.effect.amplitudes)
+        again = refit(self.current, candidate.hypothesis, amplitudes, self.parts)
+        if again is None or self.p_value > self.alpha:
+            return
+        shown = self.parts.evaluate(again.adjustment.scene)
+        proof = gain(self.heldout, shown, self.seed)
+        accepted = Accepted(again, (), shown, proof, (again,))
+        self._take(accepted, [_item(accepted), *leading])
+        progress(f"found: {again.effect.name} ({again.effect.scope.words()})")
 
     def _finding(self, accepted: Accepted, leading) -> Finding:
         chosen, parts, current = accepted.chosen, self.parts, self.current
@@ -362,6 +419,12 @@ class Search:
         scene = self.current.scene
         self.current = self.parts.fit(scene.with_effects(effects, scene.room))
         self.findings = [self.findings[k] for k in kept]
+
+
+def _item(accepted: Accepted) -> tuple[Hypothesis, float, np.ndarray]:
+    """What was chosen, as a shortlist has it."""
+    chosen = accepted.chosen
+    return chosen.hypothesis, chosen.evidence, np.asarray(chosen.effect.amplitudes)
 
 
 def _alternatives(accepted: Accepted, leading) -> tuple[Hypothesis, ...]:

@@ -102,6 +102,13 @@ def evidence(
     return drop - price_of_columns(hypothesis, columns, drop, n) - constants + 2.0 * prior
 
 
+def price(
+    hypothesis: Hypothesis, drop: float, amplitudes: np.ndarray, variance: float, n: int
+) -> float:
+    """What a hypothesis costs: columns, constants, implausibility (on the scale of chi-square)."""
+    return drop / variance - evidence(hypothesis, drop, amplitudes, variance, n)
+
+
 def price_of_columns(hypothesis: Hypothesis, columns: int, drop: float, n: int) -> float:
     """What the amplitudes of a hypothesis cost: ln n each.
 
@@ -120,16 +127,18 @@ def identity(hypothesis: Hypothesis) -> tuple:
     return names, hypothesis.course.driver, hypothesis.scope
 
 
-def shortlist(ranking: Ranking, scene: Scene, variance: float, n: int, count: int):
+def shortlist(
+    ranking: Ranking, scene: Scene, variance: float, n: int, count: int, columns: int | None = None
+):
     """The best hypotheses by evidence, one for each physics, place and kind of course.
 
-    Returns (hypothesis, evidence, one-step amplitudes), best first.
+    Returns (hypothesis, evidence, one-step amplitudes), best first; with at most so many `columns`.
     """
     seen: dict[tuple, float] = {}
     chosen = []
     weighed = [
         (hypothesis, evidence(hypothesis, drop, amplitudes, variance, n), amplitudes)
-        for hypothesis, drop, amplitudes in top(ranking, scene, 400)
+        for hypothesis, drop, amplitudes in top(ranking, scene, 400, columns)
     ]
     for hypothesis, own, amplitudes in sorted(weighed, key=lambda item: -item[1]):
         # The same terms at the same place in another course: only if it is nearly as good.

@@ -45,9 +45,13 @@ class Pose(eqx.Module):
         """Coordinates (m) of a point in the other frame."""
         return self.rotate(point) + self.shift
 
+    def unrotate(self, vector: Float[Array, "3"]) -> Float[Array, "3"]:
+        """A direction back in this frame."""
+        return self.rotation.T @ vector
+
     def unapply(self, point: Float[Array, "3"]) -> Float[Array, "3"]:
         """Coordinates (m) back in this frame, as `inverse().apply` gives them."""
-        return self.rotation.T @ (point - self.shift)
+        return self.unrotate(point - self.shift)
 
     @classmethod
     def identity(cls) -> "Pose":
@@ -79,9 +83,8 @@ class TurnedPose(Pose):
         still = self.rotation @ vector
         return still + cross(self.turn, still)
 
-    def unapply(self, point: Float[Array, "3"]) -> Float[Array, "3"]:
-        away = point - self.shift
-        return self.rotation.T @ (away - cross(self.turn, away))
+    def unrotate(self, vector: Float[Array, "3"]) -> Float[Array, "3"]:
+        return self.rotation.T @ (vector - cross(self.turn, vector))
 
 
 def pose_from_vector(vector: Float[Array, "6"] | Pose) -> Pose:

@@ -45,7 +45,10 @@ class Tables:
 
     @cached_property
     def _extent(self) -> tuple[np.ndarray, np.ndarray]:
-        """Middle and half size of all targets (m)."""
+        """Middle and half size of all targets (m); along z the middle of a plate is its plane.
+
+        Marks on posts stand off the plane z = 0, and the plate grows where it is.
+        """
         # A target whose marks are unknown has no middle and no size yet.
         points = [
             t.points if np.isfinite(t.points).all() else np.zeros((1, 3))
@@ -53,7 +56,9 @@ class Tables:
         ]
         low, high = (np.array([end(p, axis=0) for p in points]) for end in (np.min, np.max))
         half = 0.5 * (high - low)[:, :2]
-        return 0.5 * (low + high), np.where(half > 0, half, 1.0)
+        middle = 0.5 * (low + high)
+        middle[:, 2] = np.clip(0.0, low[:, 2], high[:, 2])
+        return middle, np.where(half > 0, half, 1.0)
 
     @cached_property
     def _checker(self) -> np.ndarray:

@@ -89,6 +89,22 @@ def mark(
     return grown + ports.axes("target.point")
 
 
+def centre_of_disc(
+    mark_cam: Float[Array, "3"], normal: Float[Array, "3"], ports: PortValues
+) -> Float[Array, "3"]:
+    """Point (m, camera coordinates) whose image is the centre of the image of a circular mark.
+
+    The image of a disc of radius R is an ellipse, and its centre is not the image of the disc's
+    centre. With Z the depth, n the plate's normal and e the axis of the camera it is that of a
+    point of the plate R^2 / Z (e - (e n) n) nearer (of second order in R / Z; the exact ellipse is
+    in Heikkila 2000, section 3). No mark shifts where the plate is parallel to the image.
+    """
+    if ports.plain:
+        return mark_cam
+    along = jnp.array([0.0, 0.0, 1.0]) - normal[2] * normal
+    return mark_cam - ports["target.disc"] / mark_cam[2] * along
+
+
 # --- structure and shutter ----------------------------------------------------------------------
 
 
@@ -156,7 +172,9 @@ def refract(mark_cam: Float[Array, "3"], ports: PortValues) -> Float[Array, "3"]
     Air with a constant gradient of its index bends rays to arcs of curvature k (rad per m of
     path): the mark seems displaced by k L^2 / 2 across the line of sight (MATHEMATICS 1.9). A
     plane-parallel plate of thickness d and index n, normal to the axis, brings the mark nearer by
-    d (1 - cos i / sqrt(n^2 - sin^2 i)) along the axis and turns no ray.
+    d (1 - cos i / sqrt(n^2 - sin^2 i)) along the axis and turns no ray. A plate whose far face is
+    tilted by the wedge w turns rays by (sqrt(n^2 - sin^2 i) - cos i) w, in direction cosines across
+    the axis (Snell's law at the far face, to first order in w).
     """
     if ports.plain:
         return mark_cam
@@ -165,7 +183,14 @@ def refract(mark_cam: Float[Array, "3"], ports: PortValues) -> Float[Array, "3"]
     bent = mark_cam + jnp.concatenate([bend, jnp.zeros(1)])
     cos2 = bent[2] ** 2 / (bent @ bent)
     nearer = ports["medium.window"] * (1.0 - jnp.sqrt(cos2 / (WINDOW_INDEX**2 - (1.0 - cos2))))
-    return bent.at[2].add(-nearer)
+    straight = bent.at[2].add(-nearer)
+    distance = jnp.linalg.norm(straight)
+    way = straight / distance
+    prism = jnp.sqrt(WINDOW_INDEX**2 - way[:2] @ way[:2]) - way[2]
+    across = prism * jnp.stack([ports["medium.wedge_x"], ports["medium.wedge_y"]])
+    # A direction keeps its length; nothing that is seen through a plane window is beside it.
+    along = -(way[:2] @ across) / jnp.maximum(way[2], 0.05)
+    return straight + distance * jnp.concatenate([across, along[None]])
 
 
 # --- lens, sensor, detection --------------------------------------------------------------------
@@ -233,13 +258,11 @@ def predict_pixel(
     delay = exposure_delay(at.pixel, at.image_height, ports)
     carrier, own = map(pose_from_vector, (sight.world_from_carrier, sight.carrier_from_target))
     world = place(carrier, own, target, delay, at.velocity, ports)
-    camera = look(
-        pose_from_vector(sight.world_from_station),
-        pose_from_vector(sight.station_from_camera),
-        world,
-        ports,
-    )
-    apparent = refract(camera, ports)
+    station, mounted = map(pose_from_vector, (sight.world_from_station, sight.station_from_camera))
+    camera = look(station, mounted, world, ports)
+    facing = carrier.rotate(own.rotate(jnp.array([0.0, 0.0, 1.0])))
+    normal = mounted.unrotate(station.unrotate(facing))
+    apparent = refract(centre_of_disc(camera, normal, ports), ports)
     return expose(
         sight.focal, sight.centre, image(family, sight.distortion, apparent, ports), ports
     )

@@ -36,7 +36,6 @@ OBSERVATION_DRIVERS: dict[str, str] = {
     "range": "m",
     "inverse_range": "1/m",
     "incidence": "rad",
-    "facing": "1/m",
     "motion_u": "px/s",
     "motion_v": "px/s",
     "target_x": "half width",
@@ -123,11 +122,9 @@ def observation_drivers(
 
     `image_x`, `image_y` and `radius` count from the principal point in half image diagonals;
     `row` and `column` from the middle of the image; `incidence` is the angle between the line of
-    sight and the target's normal, `facing` its cosine over the distance, positive where the
-    target's z axis points away (a disc of radius R is seen where a point R^2 cos i / d behind it
-    would be, which is the eccentricity of circular marks to second order); `checker` is +1 and
-    -1 in turn over the marks of a grid, NaN without one; `mark` is the number of the mark among all
-    targets', `epoch` that of the epoch; `along_beam` goes from -1 to 1 over a station's cameras.
+    sight and the target's normal; `checker` is +1 and -1 in turn over the marks of a grid, NaN
+    without one; `mark` is the number of the mark among all targets', `epoch` that of the epoch;
+    `along_beam` goes from -1 to 1 over a station's cameras.
     """
     at = circumstances
     world_from_target = sight.world_from_target
@@ -164,7 +161,6 @@ def observation_drivers(
             distance,
             1.0 / distance,
             jnp.arccos(jnp.clip(jnp.abs(cosine), 0.0, 1.0)),
-            cosine / distance,
             motion[0],
             motion[1],
             in_target[0],

@@ -59,6 +59,7 @@ PORTS: tuple[Port, ...] = (
         "target.twist", "target", "m", 0.05, "the corners where x and y agree in sign rise along +z"
     ),
     *_axes("target.point", "target", "m", 0.02, "a mark moves along the target's {axis} axis"),
+    Port("target.disc", "target", "m²", 0.05, "the squared radius of discs taken for points"),
     *_axes(
         "structure.shift", "structure", "m", 0.5, "the target moves along the world's {axis} axis"
     ),
@@ -82,6 +83,8 @@ PORTS: tuple[Port, ...] = (
         "a path of length L displaces the mark L²/2 along v",
     ),
     Port("medium.window", "medium", "m", 0.05, "thickness of a plane glass plate before the lens"),
+    Port("medium.wedge_x", "medium", "rad", 0.02, "wedge of a glass plate that shifts marks to +u"),
+    Port("medium.wedge_y", "medium", "rad", 0.02, "wedge of a glass plate that shifts marks to +v"),
     *_axes("station.turn", "station", "rad", 0.02, "the station turns about its own {axis} axis"),
     *_axes("station.shift", "station", "m", 0.1, "the station moves along its own {axis} axis"),
     *_axes("mount.turn", "mount", "rad", 0.02, "the camera turns about its own {axis} axis"),

@@ -172,7 +172,8 @@ def _(site):
 @effect("window-warped-by-heat", (22, 82), "svr")
 def _(site):
     """A window that is warmer in its middle is a weak lens, off the camera's axis."""
-    course = courses.sun(site) if site.scene.kind != "stereo" else courses.rate(site, "housing", 0)
+    short = site.scene.kind == "stereo"
+    course = courses.rate(site, "housing", "camera") if short else courses.sun(site)
     off = 0.3 * site.way()
 
     def field(view, xy):

@@ -165,7 +165,8 @@ def _(site):
 
         return {"target": hook}
 
-    return site.draft(hooks, 2e-6, 1e-4, course, {}, site.at_target())
+    where = site.at_target() | {"camera": [site.scene.cameras[seer].name]}
+    return site.draft(hooks, 2e-6, 1e-4, course, {}, where)
 
 
 @effect("neighbour-warms-mount", (37,), "svr", "body")

@@ -1,6 +1,6 @@
 """Named physics of the detection of marks in images."""
 
-from jaxvm.physics.catalogue.entry import ALWAYS, Entry, alternatives, pair
+from jaxvm.physics.catalogue.entry import ALWAYS, Entry, alternatives, pair, plain
 from jaxvm.physics.effects import Term
 
 _SHIFT = pair("sensor.cx", "sensor.cy")
@@ -60,18 +60,18 @@ DETECTION: tuple[Entry, ...] = (
     ),
     Entry(
         "dark-current", "dark current draws the dim marks of a target", (70,),
-        _SHIFT, ("temperature",), ("linear", "quadratic"), "target",
+        _SHIFT, ("temperature", "neighbour"), ("linear", "quadratic"), "target",
         (1e-5, 1e-1), "motion of the target", "cool the sensor; brighter marks",
         "Dark current doubles with every few kelvin and draws the measured centres of dim marks. "
         "The marks of a badly lit target shift together as the sensor warms.",
     ),
     Entry(
         "mark-eccentricity", "ellipse centres are taken for mark centres", (65,),
-        ((Term("target.point_z", "facing", "linear"),),), ALWAYS, ALWAYS, "target",
-        (1e-7, 1e-2), "marks that have a depth", "marks of two sizes",
-        "The centre of a circle's image is not the image of its centre: it is seen as if the mark "
-        "stood R² cos i / d behind the plate (radius R, incidence i, distance d). The error points "
-        "along the tilt of the target and grows with the square of the mark's size.",
+        (plain("target.disc"),), ALWAYS, ALWAYS, "target",
+        (1e-8, 1e-1), "scale of the target, marks that have a depth", "marks of two sizes",
+        "The centre of a circle's image is not the image of its centre. The error points along the "
+        "tilt of the target and grows with the square of the mark's size: the amplitude is the "
+        "squared radius of the marks.",
     ),
 )  # fmt: skip
 """Named physics of detection."""

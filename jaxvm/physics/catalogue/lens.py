@@ -157,7 +157,11 @@ LENS: tuple[Entry, ...] = (
     ),
     Entry(
         "distortion-with-range", "the distortion depends on the range", (44,),
-        ((Term("lens.k1", "inverse_range", "linear"),),), ALWAYS, ALWAYS, "camera",
+        (
+            (Term("lens.k1", "inverse_range", "linear"),),
+            # Over the slanted range, unlike over the depth, a scale is a distortion, too.
+            (Term("sensor.focal", "inverse_range", "linear"),),
+        ), ALWAYS, ALWAYS, "camera",
         (1e-5, 1e-1), "rays that do not meet in one point", "near and far targets",
         "A lens distorts near targets differently from far ones (Brown's variation of distortion). "
         "The rings of residuals change with one over the range.",

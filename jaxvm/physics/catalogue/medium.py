@@ -1,6 +1,6 @@
 """Named physics between target and lens: air and windows."""
 
-from jaxvm.physics.catalogue.entry import ALWAYS, CHANGING, THERMAL, Entry, each, plain
+from jaxvm.physics.catalogue.entry import ALWAYS, CHANGING, THERMAL, Entry, each, pair, plain
 from jaxvm.physics.catalogue.maps import image_map
 
 _AIR = ("constant", "gradient", "temperature", "irradiance")
@@ -44,6 +44,20 @@ MEDIUM: tuple[Entry, ...] = (
         (5e-4, 3e-2), "slip of the mount along the axis", "near and far targets",
         "A cover glass or a filter came before the lens, or went, at one moment. From then on near "
         "targets seem nearer and the field slightly distorted.",
+    ),
+    Entry(
+        "window-wedge", "the window is a wedge", (21,),
+        pair("medium.wedge_x", "medium.wedge_y"), ALWAYS, ALWAYS, "camera",
+        (1e-5, 2e-2), "turn of the camera, decentring of the lens", "turn the window",
+        "The faces of the window are not parallel and turn all rays by about half their angle. It "
+        "looks like a turn of the camera, but for what the slant of the rays adds at the edge.",
+    ),
+    Entry(
+        "window-refitted", "a wedged window was turned or put before the lens", (21,),
+        pair("medium.wedge_x", "medium.wedge_y"), ("time",), ("step",), "camera",
+        (1e-5, 2e-2), "slip of the mount", "take the window away; an inclinometer on the camera",
+        "A window whose faces are not parallel turns all rays by about half its angle. Put in, "
+        "taken out or turned at one moment it makes everything jump as if the camera had turned.",
     ),
     Entry(
         "wet-glass", "a film or drops on the glass bend the image from a moment on", (23,),

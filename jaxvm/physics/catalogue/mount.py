@@ -93,13 +93,6 @@ MOUNT: tuple[Entry, ...] = (
         "epochs.",
     ),
     Entry(
-        "window-refitted", "a wedged window was turned or put before the lens", (21,),
-        _TURN, ("time",), ("step",), "camera",
-        (5e-6, 5e-3), "slip of the mount", "take the window away; an inclinometer on the camera",
-        "A window whose faces are not parallel turns all rays by half its angle. Put in, taken out "
-        "or turned at one moment it makes everything jump as if the camera had turned.",
-    ),
-    Entry(
         "mount-vibration", "the camera oscillates in its mount", (32,),
         _TURN, ("time",), ("periodic",), "camera",
         (1e-6, 1e-3), "vibration of the target", "a second camera on the same station",

@@ -135,8 +135,10 @@ SENSOR: tuple[Entry, ...] = (
             plain("sensor.aspect"),
             plain("sensor.aspect", "sensor.skew"),
             plain("sensor.aspect", "sensor.focal"),
+            (Term("detect.u", "column", "linear"),),
+            (Term("detect.v", "row", "linear"),),
         ), ALWAYS, ALWAYS, "camera",
-        (1e-6, 1e-2), "scales of the target", "roll the target or the camera by 90 degrees",
+        (1e-6, 1e1), "scales of the target", "roll the target or the camera by 90 degrees",
         "The scales along rows and columns differ. Digital sensors have square pixels unless the "
         "image was resampled or its lines are timed by a wrong clock.",
     ),
