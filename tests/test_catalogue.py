@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from networks import matrix, stereo_recording, to_plane, to_point
 
-from jaxvm.discover.courses import driver_kind
+from jaxvm.discover.courses import driver_kind, kinds_in_scope
 from jaxvm.discover.hypotheses import Hypothesis, enumerate_hypotheses, member
 from jaxvm.discover.scatter import families_of_images
 from jaxvm.network.binding import in_scope, range_driver_table
@@ -163,6 +163,30 @@ def test_the_kind_of_a_channel_decides_the_name():
     # What each mark has for itself is named whatever their number.
     marks = each("mark", "target.point_z", numbers=range(7, 20))
     assert names(marks, "target", "constant", "constant") == ["marks-of-other-depth"]
+
+
+def test_the_body_of_a_camera_is_a_neighbour_of_what_does_not_carry_it():
+    recording = parted_scene().recording
+    time = recording.drivers.time
+    names = ("ambient_degC", "body_left_degC", "body_right_degC")
+    channels = {name: np.linspace(10.0, 12.0 + k, len(time)) for k, name in enumerate(names)}
+    scene = build(replace(recording, drivers=Drivers(time, channels)))
+
+    def kinds(scope, driver="body_left_degC", kind="quantity"):
+        return kinds_in_scope(kind, driver, scope, scene)
+
+    own = ("quantity", "temperature")
+    assert kinds(Scope(camera=("left",))) == kinds(Scope(station=("bar",))) == own
+    assert "neighbour" in kinds(Scope(camera=("right",)))
+    assert "neighbour" in kinds(Scope(station=("other",)))
+    # Targets are as warm as the air, which is logged.
+    target = Scope(target=(scene.model.targets[0].name,))
+    assert kinds(target) == ("neighbour",)
+    assert kinds(target, "ambient_degC") == own
+    difference = "body_left_degC - ambient_degC"
+    assert kinds(Scope(station=("bar",)), difference, "difference") == own
+    assert "neighbour" in kinds(Scope(station=("other",)), difference, "difference")
+    assert kinds(Scope(), kind="time") == ("time",)
 
 
 # --- every entry can be found ---------------------------------------------------------------------

@@ -71,6 +71,7 @@ FACTS = Facts(
     600.0,
     0.0,
     False,
+    {"a": ("l",), "b": ("l", "r")},
 )
 
 
@@ -97,6 +98,9 @@ def test_names():
         ({"target": ["a"], "point": ["p3"]}, {"target": ["a"], "point": ["p3"]}, True),
         ({"target": ["a"], "point": ["p3"]}, {"target": ["a"]}, False),
         ({"target": ["a"]}, {"camera": ["l"]}, False),
+        ({"target": ["a"], "camera": ["l"]}, {"target": ["a"]}, True),
+        ({"target": ["b"], "camera": ["l"]}, {"target": ["b"]}, False),
+        ({"target": ["b"], "camera": ["l"]}, {"target": ["b"], "camera": ["l"]}, True),
     ],
 )
 def test_places(true, claimed, same):

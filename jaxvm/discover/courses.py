@@ -5,6 +5,7 @@ are asked on a grid; a refit refines them.
 """
 
 import math
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,9 @@ _MOST_INSTANTS = 60
 
 _RAMPS, _EVENTS = np.linspace(0.1, 0.8, 8), np.linspace(0.1, 0.7, 7)
 """Shares of the epochs before a ramp, or an event after which something settles."""
+
+_DOUBLING = 7.0
+"""Kelvin in which dark current doubles: 6 to 8 for most sensors."""
 
 _STAIRS = [(share, k / 8.0) for share in np.geomspace(0.1, 0.5, 20).tolist() for k in range(8)]
 """Height of a stair as a share of a quantity's range, and where it begins: no refit moves them."""
@@ -64,8 +68,6 @@ def kinds_in_scope(kind: str, driver: str, scope: Scope, scene: Scene) -> tuple[
     body = _camera_of(driver)
     if not body or scope == Scope() or scope.rangefinder:
         return ("quantity", own)
-    if scope.target and kind == "difference":
-        return ("difference",)
     if scope.target:
         return ("neighbour",) if _air_is_logged(scene) else ("quantity", own, "neighbour")
     stations = {camera.name: camera.station for camera in scene.model.cameras}
@@ -78,8 +80,8 @@ def kinds_in_scope(kind: str, driver: str, scope: Scope, scene: Scene) -> tuple[
 
 def _camera_of(driver: str) -> str:
     """The camera whose body's temperature a driver is, alone or against the air's; or ""."""
-    name = driver.split(" - ")[0]
-    return name.removeprefix("body_").removesuffix("_degC") if name.startswith("body_") else ""
+    found = re.fullmatch(r"body_(.+?)_degC( - .*)?", driver)
+    return found[1] if found else ""
 
 
 def _air_is_logged(scene: Scene) -> bool:
@@ -148,6 +150,7 @@ def _of_quantity(driver: str, channels: Channels, lags: list[float]) -> list[Cou
             for tau in (0.4 * lags[0], lags[0], lags[2])
         ),
         Course(driver, "ageing", (), reference),
+        Course(driver, "doubling", (_DOUBLING,), reference),
         *(Course(driver, "turning", (times * span,), reference) for times in (4.0, 7.0, 15.0)),
         *(
             Course(driver, "staircase", (share * width, phase), reference)

@@ -48,6 +48,7 @@ NAMED_ONLY = (
     "square",
     "ageing",
     "staircase",
+    "doubling",
     "two decays",
     "direction",
 )
@@ -252,9 +253,9 @@ def enumerate_hypotheses(scene: Scene) -> tuple[Family, ...]:
         *_as_named(every_named, courses, kinds, listed),
         *((_of_size(marks, size), of_marks) for size in (1, 2, 3)),
         *_free_forms(scene, constant),
-        *_of_each_mark(scene, constant),
+        *_of_each_mark(scene, courses, kinds),
     ]
-    asked = _asked_of_names(courses, kinds)
+    asked = _asked_of_names(scene, courses)
     families = (
         _family(scene, groups, own, scopes, asked) for groups, own in candidates if groups and own
     )
@@ -264,7 +265,7 @@ def enumerate_hypotheses(scene: Scene) -> tuple[Family, ...]:
 def families_of(scene: Scene, groups: list[Group]) -> tuple[Family, ...]:
     """Families of given groups that never change, for all scopes."""
     constant, scopes = [Course("constant", "constant")], _scopes(scene)
-    asked = _asked_of_names(constant, {"constant": ("constant",)})
+    asked = _asked_of_names(scene, constant)
     return tuple(_family(scene, [group], constant, scopes, asked) for group in groups)
 
 
@@ -294,11 +295,35 @@ def _variants(entry: Entry, group: Group) -> int:
     return sum(alike == [(t.port, t.driver, t.basis) for t in own] for own in entry.groups) or 1
 
 
-def _asked_of_names(courses: list[Course], kinds: dict[str, tuple[str, ...]]) -> dict[str, int]:
-    """Number of drivers and forms in which each entry of the catalogue is asked."""
+def _asked_of_names(scene: Scene, courses: list[Course]) -> dict[str, int]:
+    """Number of drivers and forms in which each entry of the catalogue is asked of one body."""
+    model = scene.model
+    one = {
+        kind: Scope(**{kind: (bodies[0].name,)})
+        for kind, bodies in (
+            ("camera", model.cameras),
+            ("station", model.stations),
+            ("target", model.targets),
+            ("rangefinder", model.rangefinders),
+        )
+        if bodies
+    }
+    one |= {kind: one["target"] for kind in ("face", "mark")}
     distinct = {(course.driver, course.form) for course in courses}
+    kinds = {
+        (kind, driver): kinds_in_scope(driver_kind(scene, driver), driver, scope, scene)
+        for kind, scope in one.items()
+        for driver in {driver for driver, _ in distinct}
+        if _follows(scope, driver)
+    }
     return {
-        entry.id: max(sum(entry.takes(kinds[driver], form) for driver, form in distinct), 1)
+        entry.id: max(
+            sum(
+                (entry.entity, driver) in kinds and entry.takes(kinds[entry.entity, driver], form)
+                for driver, form in distinct
+            ),
+            1,
+        )
         for entry in CATALOGUE
     }
 
@@ -332,7 +357,9 @@ def _has(scope: Scope, group: Group) -> bool:
 
 
 def _follows(scope: Scope, driver: str) -> bool:
-    """Whether a driver is one for the bodies of a scope: some belong to single cameras."""
+    """Whether a driver is one for the bodies of a scope: some belong to cameras."""
+    if scope.target and " - " in driver:
+        return False
     if driver in (OWN_BODY, OWN_POWER_ON):
         return len(scope.camera) > 1
     camera = driver.removeprefix("time since power-on of ")
@@ -426,20 +453,19 @@ def _free_forms(scene: Scene, constant: list[Course]):
     yield [Group(plate_map(), "target")], constant
 
 
-def _of_each_mark(scene: Scene, constant: list[Course]):
+def _of_each_mark(scene: Scene, courses: list[Course], kinds: dict[str, tuple[str, ...]]):
     """Physics that every mark of a target has to an extent of its own."""
-    signatures = dict.fromkeys(
-        terms for entry in CATALOGUE for terms in entry.groups if terms[0].driver == "mark"
-    )
-    for target, first in zip(scene.model.targets, scene.first_point, strict=False):
-        if "points" in target.free:
-            continue
-        marks = range(int(first), int(first) + len(target.points))
-        ports = [[term.port for term in terms] for terms in signatures]
-        yield (
-            [
-                Group(each("mark", *own, numbers=marks), "target", target=target.name)
-                for own in ports
-            ],
-            constant,
-        )
+    for entry in CATALOGUE:
+        for terms in (own for own in entry.groups if own[0].driver == "mark"):
+            ports = [term.port for term in terms]
+            known = [
+                course
+                for course in courses
+                if entry.takes(kinds[course.driver], course.form)
+                and len(FORMS[course.form].bases) == 1
+            ]
+            for target, first in zip(scene.model.targets, scene.first_point, strict=False):
+                if "points" not in target.free:
+                    marks = range(int(first), int(first) + len(target.points))
+                    own = each("mark", *ports, numbers=marks)
+                    yield [Group(own, "target", target=target.name)], known

@@ -30,9 +30,9 @@ _HOPEFUL = 0.6
 
 
 def worth_a_second_thought(findings: list[Finding]) -> bool:
-    """Whether findings may be a pair of others: several, or a wide one; no free forms."""
+    """Whether findings may be a pair of others: several, or a wide one; not after a free form."""
     columns = [len(finding.effect.amplitudes) for finding in findings]
-    return bool(columns) and max(columns) <= FREE and (len(columns) > 1 or columns[0] >= WIDE)
+    return bool(columns) and columns[0] <= FREE and (len(columns) > 1 or columns[0] >= WIDE)
 
 
 def of_other_places(ranking: Ranking, plain: Adjustment, found: Hypothesis, n: int) -> list:

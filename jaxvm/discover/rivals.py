@@ -24,6 +24,13 @@ MOST, PLACES = 8, 3
 
 _ODDS = 20.0
 
+_COARSE = 1e-3
+"""Share of an effect's drop that its form leaves open.
+
+No effect follows its driver quite as a form says. Where chi-square runs to ten thousands the
+remainder outweighs any odds between rivals that differ by less than that.
+"""
+
 
 @dataclass(frozen=True)
 class Rival:
@@ -81,6 +88,9 @@ def rivals(
     variance = after.variance_factor
     change = stacked(before) - stacked(after)
     full = float(np.sum(change**2)) / variance
+    # The gap that decides, and by how much smaller ones are shrunk.
+    limit = DECIDED + _COARSE * full
+    shrunk = DECIDED / limit
     claims: dict[tuple, _Claim] = {}
     own_amplitudes = np.asarray(effect.amplitudes)
     own_prior = log_prior(own, own_amplitudes)
@@ -100,18 +110,18 @@ def rivals(
     for some in (tests, tests.about(refined) if refined else None):
         if some is not None:
             alike = some.score(variance, residual=change)
-            found += list(_resembling(alike, scene, own, full, variance))
+            found += list(_resembling(alike, scene, own, full, variance, limit))
     own_price = min((price for h, _, price, _ in found if h.same(own)), default=0.0)
     prices = {_course_of(h): price for h, _, price, _ in reversed(found)}
     for hypothesis, gap, _, amplitudes in found:
-        if gap <= DECIDED:
+        if gap <= limit:
             columns = price_of_columns(hypothesis, len(amplitudes), full - gap, n)
             cost = columns - own_columns + prices[_course_of(hypothesis)] - own_price
-            weigh(hypothesis, amplitudes, gap, -0.5 * (gap + cost))
+            weigh(hypothesis, amplitudes, gap, -0.5 * (shrunk * gap + cost))
     for hypothesis, amplitudes, behind in shown:
-        if behind <= DECIDED and not hypothesis.same(own):
+        if behind <= limit and not hypothesis.same(own):
             prior = log_prior(hypothesis, np.asarray(amplitudes)) - own_prior
-            weigh(hypothesis, amplitudes, max(behind, 0.0), -0.5 * behind - prior)
+            weigh(hypothesis, amplitudes, max(behind, 0.0), -0.5 * shrunk * behind - prior)
     weigh(own, own_amplitudes, 0.0, 0.0)
 
     total = np.logaddexp.reduce([claim.weight for claim in claims.values()])
@@ -154,8 +164,10 @@ def _course_of(hypothesis: Hypothesis) -> tuple:
     return hypothesis.group, hypothesis.scope, course.driver, course.form
 
 
-def _resembling(ranking: Ranking, scene, own: Hypothesis, full: float, variance: float):
-    """Hypotheses that explain an effect up to the decision limit, and the chosen one.
+def _resembling(
+    ranking: Ranking, scene, own: Hypothesis, full: float, variance: float, limit: float
+):
+    """Hypotheses that explain an effect up to the limit, and the chosen one.
 
     Yields (hypothesis, gap, price of its constants, amplitudes). Constants are integrated over
     their grid: one that may take any value costs nothing, one that must have a single value of
@@ -168,8 +180,8 @@ def _resembling(ranking: Ranking, scene, own: Hypothesis, full: float, variance:
         for kind, places in family.by_driver_and_form().items():
             best = drops[:, places].max(axis=1)
             mine = (own.course.driver, own.course.form) == kind
-            for g, s in np.argwhere(best >= full - DECIDED if not mine else np.isfinite(best)):
-                if best[g, s] < full - DECIDED and family.groups[g].terms != own.group.terms:
+            for g, s in np.argwhere(best >= full - limit if not mine else np.isfinite(best)):
+                if best[g, s] < full - limit and family.groups[g].terms != own.group.terms:
                     continue
                 each = drops[g, places, s]
                 mean = 2.0 * np.logaddexp.reduce(0.5 * each) - 2.0 * np.log(len(places))

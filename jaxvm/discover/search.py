@@ -19,7 +19,6 @@ from jaxvm.discover.scatter import ALIKE, likeness, of_each_image
 from jaxvm.discover.score import ScoreTests
 from jaxvm.discover.select import Candidate, identity, refit, shortlist, stacked
 from jaxvm.discover.waves import strongest_wave
-from jaxvm.physics.effects import Effect
 from jaxvm.physics.forms import FORMS
 from jaxvm.solve.adjust import Adjustment
 from jaxvm.solve.covariance import effect_deviations
@@ -123,7 +122,8 @@ class Search:
                     self.p_value = min(scored, self.p_value)
                     break
             self.unproven = ""
-            effect = self._take(accepted, leading)
+            effect = accepted.chosen.effect
+            self._take(accepted, leading)
             progress(f"found: {effect.name} ({effect.scope.words()})")
             if len(self.findings) > 1 and min(f.p_value for f in self.findings[-2:]) > self.alpha:
                 break
@@ -196,14 +196,10 @@ class Search:
         fitted = refit(self.current, hypothesis, amplitudes, self.parts)
         return None if fitted is None else stacked(fitted.adjustment)
 
-    def _take(self, accepted: Accepted, leading) -> Effect:
+    def _take(self, accepted: Accepted, leading) -> None:
         """Take an accepted hypothesis into the model, and look at the earlier findings again."""
         parts = self.parts
         finding = self._finding(accepted, leading)
-        named = self._named(accepted, finding)
-        if named is not None:
-            accepted, leading = named, [_item(named), *leading]
-            finding = self._finding(accepted, leading)
         former = [*self.findings, finding]
         self.heldout = accepted.heldout
         current = replace(accepted.chosen.adjustment, scene=accepted.heldout.scene)
@@ -218,23 +214,6 @@ class Search:
         # What did not help before may help beside the new one.
         self._hopeless = set(self._superfluous)
         self.findings = self._confirmed()
-        return accepted.chosen.effect
-
-    def _named(self, accepted: Accepted, finding: Finding) -> Accepted | None:
-        """A name that outweighs what has none, in its place; None where there is none."""
-        heavier = [r for r in finding.rivals if r.hypothesis.entries and r.weight > finding.weight]
-        if finding.hypothesis.entries or not heavier:
-            return None
-        other = heavier[0].hypothesis
-        columns = len(other.group.terms) * len(FORMS[other.course.form].bases)
-        again = refit(self.current, other, np.zeros(columns), self.parts)
-        if again is None:
-            return None
-        shown = self.parts.evaluate(again.adjustment.scene)
-        if shown.rms_px > _WORSE * accepted.heldout.rms_px:
-            return None
-        proof = gain(self.heldout, shown, self.seed)
-        return Accepted(again, (accepted.chosen,), shown, proof, (*accepted.tried, again))
 
     def _as_good_on_heldout(self, candidate: Candidate) -> bool:
         shown = self.parts.evaluate(candidate.adjustment.scene)
@@ -242,15 +221,16 @@ class Search:
 
     def _take_as_given(self, candidate: Candidate, progress: Callable[[str], None]) -> None:
         """Take a hypothesis that was chosen already, as if it had led."""
-        leading = [item for item in self._score() if not item[0].same(candidate.hypothesis)]
+        self._score()
         amplitudes = np.asarray(candidate.effect.amplitudes)
         again = refit(self.current, candidate.hypothesis, amplitudes, self.parts)
         if again is None or self.p_value > self.alpha:
             return
         shown = self.parts.evaluate(again.adjustment.scene)
         proof = gain(self.heldout, shown, self.seed)
-        accepted = Accepted(again, (), shown, proof, (again,))
-        self._take(accepted, [_item(accepted), *leading])
+        # What led beside it took parts of both, and is no rival.
+        leading = [(again.hypothesis, again.evidence, amplitudes)]
+        self._take(Accepted(again, (), shown, proof, (again,)), leading)
         progress(f"found: {again.effect.name} ({again.effect.scope.words()})")
 
     def _finding(self, accepted: Accepted, leading) -> Finding:
@@ -419,12 +399,6 @@ class Search:
         scene = self.current.scene
         self.current = self.parts.fit(scene.with_effects(effects, scene.room))
         self.findings = [self.findings[k] for k in kept]
-
-
-def _item(accepted: Accepted) -> tuple[Hypothesis, float, np.ndarray]:
-    """What was chosen, as a shortlist has it."""
-    chosen = accepted.chosen
-    return chosen.hypothesis, chosen.evidence, np.asarray(chosen.effect.amplitudes)
 
 
 def _alternatives(accepted: Accepted, leading) -> tuple[Hypothesis, ...]:

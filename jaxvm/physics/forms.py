@@ -95,6 +95,7 @@ BASES: dict[str, Callable[[Course, Course, Constants], Course]] = {
     "decay": lambda x, t, c: jnp.exp(-jnp.maximum(x, 0.0) / c[0]),
     "slow decay": lambda x, t, c: jnp.exp(-jnp.maximum(x, 0.0) / c[1]),
     "staircase": lambda x, t, c: c[0] * (jnp.round(x / c[0] - c[1]) + c[1]),
+    "doubling": lambda x, t, c: jnp.exp2(jnp.clip(x / c[0], -30.0, 30.0)),
     "turned": lambda x, t, c: x * jnp.cos(2.0 * jnp.pi * (t - t[0]) / c[0]),
     "turned aside": lambda x, t, c: x * jnp.sin(2.0 * jnp.pi * (t - t[0]) / c[0]),
     "sine": lambda x, t, c: jnp.sin(2.0 * jnp.pi * x / c[0]),
@@ -250,6 +251,13 @@ FORMS: dict[str, Form] = {
             ("decay", "slow decay"),
             (_TAU, Constant("slow time constant", "s")),
             "fading with two time constants of {driver}",
+        ),
+        Form(
+            "doubling",
+            ("doubling",),
+            (Constant("doubling", "driver"),),
+            "doubling again and again with {driver}",
+            centred=True,
         ),
         Form(
             "turning",

@@ -125,7 +125,8 @@ def rate(site, series, owner=None):
     smooth = max(60.0, 0.01 * site.length)
     return follow(
         site, series, owner,
-        lambda x: np.gradient(lagged(x, smooth), STEP) * 3600.0, constants={"tau_s": smooth},
+        lambda x: np.gradient(lagged(x, smooth), STEP) * 3600.0,
+        constants={"tau_s": smooth, "rate_s": 3600.0},
     )  # fmt: skip
 
 

@@ -50,7 +50,8 @@ def _(site):
     course = courses.Course(
         lambda v: v.air("gradient_K_per_m"), "gradient_K_per_m", "with driver", None, {}, True
     )
-    ports = {"medium.bend_v": 0.5 * abs(refraction.INDEX_PER_KELVIN)}
+    # Where it is warmer above, rays are bowed upwards and marks are seen too high.
+    ports = {"medium.bend_v": -abs(refraction.INDEX_PER_KELVIN)}
     draft = _bending(site, lambda x: np.broadcast_to(up, x.shape), course, 0.3, 3.0, ports)
     draft.sign = 1.0
     return draft
