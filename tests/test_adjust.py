@@ -14,6 +14,7 @@ from networks import (
     matrix,
     nudged,
     relay_recording,
+    stereo_recording,
     vector,
 )
 from scipy.spatial.transform import Rotation
@@ -173,6 +174,35 @@ def test_what_is_known_of_held_parameters_does_no_harm():
     problem = scene_problem(known.true_scene())
     normal = normal_at(problem, jnp.zeros(problem.n))
     assert np.isfinite(np.asarray(normal.gradient)).all()
+
+
+def test_a_range_to_what_no_camera_sees_says_nothing():
+    known = stereo_recording()
+    obs, ranges = known.recording.observations, known.recording.ranges
+    moving = next(
+        t for t, target in enumerate(known.recording.model.targets) if target.motion != "static"
+    )
+    lone = np.flatnonzero((ranges.target == moving) & (ranges.epoch == 2))
+    assert len(lone)
+    seen = (obs.target != moving) | (obs.epoch != 2)
+    unseen = type(obs)(**{name: own[seen] for name, own in vars(obs).items()})
+    recording = replace(known.recording, observations=unseen)
+    with_it = adjust(known.true_scene(recording), rtol=1e-10)
+    assert np.array_equal(
+        np.flatnonzero(np.asarray(with_it.scene.network.ranges.weight) == 0.0), lone
+    )
+    kept = np.delete(np.arange(len(ranges.epoch)), lone)
+    fewer = type(ranges)(**{name: own[kept] for name, own in vars(ranges).items()})
+    without = adjust(known.true_scene(replace(recording, ranges=fewer)), rtol=1e-10)
+    assert with_it.cost == pytest.approx(without.cost, rel=1e-9)
+    assert with_it.degrees_of_freedom == without.degrees_of_freedom
+    # A target whose pose is given is somewhere, seen or not.
+    still = next(t for t in range(len(known.recording.model.targets)) if t != moving)
+    given = "pose" not in recording.model.targets[still].free
+    gone = type(obs)(**{name: own[obs.target != still] for name, own in vars(obs).items()})
+    scene = known.true_scene(replace(known.recording, observations=gone))
+    weight = np.asarray(scene.network.ranges.weight)[ranges.target == still]
+    assert given and weight.all()
 
 
 def test_ranges_give_scale():

@@ -65,11 +65,13 @@ def test_a_wide_name_gives_way_to_two_narrow_ones(two):
 
 
 def test_a_narrow_name_alone_needs_no_second_thought():
-    def of(columns):
-        return SimpleNamespace(effect=SimpleNamespace(amplitudes=(0.0,) * columns))
+    def of(columns, *names):
+        effect = SimpleNamespace(amplitudes=(0.0,) * columns)
+        return SimpleNamespace(effect=effect, hypothesis=SimpleNamespace(entries=names))
 
     assert not worth_a_second_thought([])
-    assert not worth_a_second_thought([of(1)])
-    assert worth_a_second_thought([of(1), of(1)])
-    assert worth_a_second_thought([of(6)])
-    assert not worth_a_second_thought([of(24), of(1)])
+    assert not worth_a_second_thought([of(1, "one")])
+    assert worth_a_second_thought([of(1, "one"), of(1, "other")])
+    assert worth_a_second_thought([of(6, "wide")])
+    assert worth_a_second_thought([of(1)])
+    assert not worth_a_second_thought([of(24), of(1, "one")])

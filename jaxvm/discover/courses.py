@@ -65,11 +65,11 @@ def kinds_in_scope(kind: str, driver: str, scope: Scope, scene: Scene) -> tuple[
     if kind not in ("quantity", "difference", "own"):
         return tuple(kind.split(" or "))
     own = channel_kind(driver)
-    body = _camera_of(driver)
+    body = camera_of(driver)
     if not body or scope == Scope() or scope.rangefinder:
         return ("quantity", own)
     if scope.target:
-        return ("neighbour",) if _air_is_logged(scene) else ("quantity", own, "neighbour")
+        return ("neighbour",) if air_is_logged(scene) else ("quantity", own, "neighbour")
     stations = {camera.name: camera.station for camera in scene.model.cameras}
     near = scope.camera or [name for name, at in stations.items() if at in scope.station]
     if body in near:
@@ -78,15 +78,16 @@ def kinds_in_scope(kind: str, driver: str, scope: Scope, scene: Scene) -> tuple[
     return ("neighbour",) if logged else ("quantity", own, "neighbour")
 
 
-def _camera_of(driver: str) -> str:
+def camera_of(driver: str) -> str:
     """The camera whose body's temperature a driver is, alone or against the air's; or ""."""
     found = re.fullmatch(r"body_(.+?)_degC( - .*)?", driver)
     return found[1] if found else ""
 
 
-def _air_is_logged(scene: Scene) -> bool:
+def air_is_logged(scene: Scene) -> bool:
+    """Whether a temperature is logged that is not that of a camera."""
     channels = scene.network.channels.names
-    return any(channel_kind(c) == "temperature" and not _camera_of(c) for c in channels)
+    return any(channel_kind(c) == "temperature" and not camera_of(c) for c in channels)
 
 
 def enumerate_courses(scene: Scene) -> list[Course]:
@@ -116,7 +117,7 @@ def courses_of_marks(courses: list[Course], n_marks: int) -> list[Course]:
         and channel_kind(course.driver) == "temperature"
         and course.driver != OWN_BODY  # a mark belongs to no camera
     ]
-    warm = [course for course in warm if not _camera_of(course.driver)] or warm
+    warm = [course for course in warm if not camera_of(course.driver)] or warm
     every = math.ceil(max(n_marks * sum(map(len, slow)) / _MOST_OF_MARKS, 1.0))
     return [courses[0], *warm, *(course for own in slow for course in own[::every])]
 
@@ -208,7 +209,7 @@ def _of_time(driver: str, channels: Channels, lags: list[float]) -> list[Course]
     instants = (0.5 * (since[1:] + since[:-1]))[2:-2]
     if len(instants) > _MOST_INSTANTS:
         instants = instants[np.linspace(0, len(instants) - 1, _MOST_INSTANTS).astype(int)]
-    periods = span / np.arange(1.0, min(span / (2.5 * _spacing(channels)), 34.0), 0.5)
+    periods = span / np.arange(1.0, min(span / (2.05 * _spacing(channels)), 34.0), 0.5)
     return [
         *_of_clock(driver, channels, lags),
         Course(driver, "linear", (), _reference(driver, channels)),

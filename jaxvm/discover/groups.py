@@ -42,6 +42,9 @@ _PATTERNS: tuple[tuple[str, str, tuple[float, ...]], ...] = (
 _TWICE = {("target.point_z", "target_x", "square"), ("target.point_z", "target_y", "square")}
 """Patterns that are ports by another name: these are `target.bow_x` and `bow_y`."""
 
+_AS_NAMED = ("target.disc", "medium.wedge_x", "medium.wedge_y")
+"""Ports that follow nothing: the size of marks stays, and a wedge is there or is not."""
+
 _PATTERNED_PORTS = ("detect.u", "detect.v", "sensor.focal", "target.point_z")
 
 
@@ -63,9 +66,10 @@ def every_port() -> list[Group]:
 
 
 def single_groups() -> list[Group]:
-    """Each port alone that means something without a pattern."""
+    """Each port alone that means something without a pattern and without a name."""
     # A detector that measures too far everywhere is a principal point that moved.
-    return [group for group in every_port() if group.terms[0].port not in ("detect.u", "detect.v")]
+    other = ("detect.u", "detect.v", *_AS_NAMED)
+    return [group for group in every_port() if group.terms[0].port not in other]
 
 
 def patterned_groups() -> list[Group]:
@@ -90,9 +94,14 @@ def marks_of(scene: Scene) -> list[Group]:
     return groups
 
 
-def is_patterned(group: Group) -> bool:
-    """Whether any term differs from observation to observation."""
-    return any(term.driver not in ("one", "along_beam") for term in group.terms)
+def is_special(group: Group) -> bool:
+    """Whether a group is asked in the courses of its names alone.
+
+    So are patterns that differ from observation to observation, and ports that don't move.
+    """
+    return any(
+        term.driver not in ("one", "along_beam") or term.port in _AS_NAMED for term in group.terms
+    )
 
 
 def entity_of(port: str) -> str:

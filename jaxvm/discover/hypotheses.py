@@ -14,6 +14,8 @@ from jaxtyping import Float
 
 from jaxvm.discover.courses import (
     Course,
+    air_is_logged,
+    camera_of,
     courses_of_marks,
     driver_kind,
     enumerate_courses,
@@ -24,7 +26,7 @@ from jaxvm.discover.groups import (
     Group,
     entity_of,
     every_port,
-    is_patterned,
+    is_special,
     marks_of,
     patterned_groups,
     single_groups,
@@ -239,7 +241,7 @@ def enumerate_hypotheses(scene: Scene) -> tuple[Family, ...]:
     # Named groups without a pattern follow every course; the others only those that have a name.
     listed = {*single, *patterned}
     every_named = list(dict.fromkeys(named))
-    moving = [g for g in every_named if g not in listed and not is_patterned(g)]
+    moving = [g for g in every_named if g not in listed and not is_special(g)]
     common = [course for course in courses if course.form not in NAMED_ONLY]
     by_bases = {n: [c for c in common if len(FORMS[c.form].bases) == n] for n in (1, 2)}
     constant = [Course("constant", "constant")]
@@ -309,23 +311,19 @@ def _asked_of_names(scene: Scene, courses: list[Course]) -> dict[str, int]:
         if bodies
     }
     one |= {kind: one["target"] for kind in ("face", "mark")}
-    distinct = {(course.driver, course.form) for course in courses}
+    distinct = {(course.driver, course.form): course for course in courses}
     kinds = {
-        (kind, driver): kinds_in_scope(driver_kind(scene, driver), driver, scope, scene)
+        (kind, *named): kinds_in_scope(driver_kind(scene, named[0]), named[0], scope, scene)
         for kind, scope in one.items()
-        for driver in {driver for driver, _ in distinct}
-        if _follows(scope, driver)
+        for named, course in distinct.items()
+        if _follows(scene, scope, course)
     }
-    return {
-        entry.id: max(
-            sum(
-                (entry.entity, driver) in kinds and entry.takes(kinds[entry.entity, driver], form)
-                for driver, form in distinct
-            ),
-            1,
-        )
-        for entry in CATALOGUE
-    }
+
+    def asked(entry: Entry) -> int:
+        own = (kinds.get((entry.entity, *named), ()) for named in distinct)
+        return sum(entry.takes(k, form) for k, (_, form) in zip(own, distinct, strict=True))
+
+    return {entry.id: max(asked(entry), 1) for entry in CATALOGUE}
 
 
 def _family(scene: Scene, groups, courses, scopes, named: dict[str, int]) -> Family:
@@ -333,7 +331,7 @@ def _family(scene: Scene, groups, courses, scopes, named: dict[str, int]) -> Fam
     distinct = set(zip(driven, ((c.driver, c.form) for c in courses), strict=True))
     asked = Counter(kind for kind, _ in distinct)
     group_scope = np.array([[_has(scope, group) for scope in scopes] for group in groups])
-    course_scope = np.array([[_follows(s, course.driver) for s in scopes] for course in courses])
+    course_scope = np.array([[_follows(scene, s, course) for s in scopes] for course in courses])
     valid = group_scope[:, None, :] & course_scope[None]
     # What nothing in this recording has (a rangefinder, say) is not computed either.
     seen = np.flatnonzero(valid.any(axis=(1, 2)))
@@ -356,12 +354,14 @@ def _has(scope: Scope, group: Group) -> bool:
     return _kind(scope) == group.entity and (not group.target or scope.target == (group.target,))
 
 
-def _follows(scope: Scope, driver: str) -> bool:
-    """Whether a driver is one for the bodies of a scope: some belong to cameras."""
-    if scope.target and " - " in driver:
-        return False
+def _follows(scene: Scene, scope: Scope, course: Course) -> bool:
+    """Whether a course is one for the bodies of a scope: some drivers belong to cameras."""
+    driver = course.driver
     if driver in (OWN_BODY, OWN_POWER_ON):
         return len(scope.camera) > 1
+    if scope.target and camera_of(driver) and course.form != "doubling":
+        # Targets are as warm as the air. What doubles is the dark current of a camera.
+        return not air_is_logged(scene)
     camera = driver.removeprefix("time since power-on of ")
     return camera == driver or scope.camera == (camera,)
 
@@ -382,13 +382,13 @@ def _as_named(
     together: dict[tuple, list[Group]] = {}
     for group in [*groups, *every_port()]:
         entries = [e for e in CATALOGUE if group.terms in e.groups and e.entity == group.entity]
-        patterned = is_patterned(group)
+        special = is_special(group)
         many = len(group.terms) > FREE
         own = tuple(
             place
             for place, course in enumerate(courses)
             if not (many and course.form == "step" and place not in within)
-            and (course.form in NAMED_ONLY or (patterned and (place or group not in listed)))
+            and (course.form in NAMED_ONLY or (special and (place or group not in listed)))
             and any(entry.takes(kinds[course.driver], course.form) for entry in entries)
         )
         for n in (1, 2, 3):

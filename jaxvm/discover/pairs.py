@@ -30,9 +30,15 @@ _HOPEFUL = 0.6
 
 
 def worth_a_second_thought(findings: list[Finding]) -> bool:
-    """Whether findings may be a pair of others: several, or a wide one; not after a free form."""
-    columns = [len(finding.effect.amplitudes) for finding in findings]
-    return bool(columns) and columns[0] <= FREE and (len(columns) > 1 or columns[0] >= WIDE)
+    """Whether findings may be a pair of others: several, or one that is wide or has no name.
+
+    Not after a free form.
+    """
+    if not findings or len(findings[0].effect.amplitudes) > FREE:
+        return False
+    first = findings[0]
+    doubtful = len(first.effect.amplitudes) >= WIDE or not first.hypothesis.entries
+    return len(findings) > 1 or doubtful
 
 
 def of_other_places(ranking: Ranking, plain: Adjustment, found: Hypothesis, n: int) -> list:

@@ -166,7 +166,9 @@ class Search:
         wave, p, drop = strongest_wave(current.scene, residual, self.seed)
         columns = np.zeros(len(wave.group.terms) * len(FORMS[wave.course.form].bases))
         leading = [(wave, drop / variance, columns)]
-        if p > self.alpha and likeness(current.scene, residual) > ALIKE:
+        alike = likeness(current.scene, residual)
+        # Where neighbours are only a little alike, it may be noise that they share.
+        if p > self.alpha and (alike > ALIKE or alike == 0.0):
             leading, p = of_each_image(
                 current.scene, self._tests, variance, self.parts.n, self._left_by
             )

@@ -171,7 +171,7 @@ class Tables:
         return RangeFactor(
             slots=jnp.asarray(np.concatenate(slots, axis=1)),
             sigma=jnp.asarray(ranges.sigma[:, None]),
-            weight=jnp.ones(n),
+            weight=jnp.asarray(self._placed(ranges.target, ranges.epoch), float),
             circumstances=self.circumstances(
                 ranges.epoch, ranges.target, point, np.zeros((n, 2)), np.ones(n), np.full(n, np.nan)
             ),
@@ -180,6 +180,16 @@ class Tables:
             view=jnp.asarray(self.channels.view(0, ranges.epoch)),
             pattern=jnp.zeros((n, 0)),
         )
+
+    def _placed(self, target, epoch) -> np.ndarray:
+        """Which ranges are to a target that is somewhere: given, seen, or ranged often enough.
+
+        One range to a target that no camera sees in that epoch says nothing of anything else.
+        """
+        obs, row = self.recording.observations, self.target_row[target, epoch]
+        given = np.array(["pose" not in t.free for t in self.model.targets])[target]
+        seen = np.isin(row, self.target_row[obs.target, obs.epoch])
+        return given | seen | (np.bincount(row)[row] >= 6)
 
     def _carriers(self, target, epoch) -> np.ndarray:
         """Slots of what carries targets: their stations, or the world."""

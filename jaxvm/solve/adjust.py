@@ -238,7 +238,9 @@ def _adjusted(
         problem = with_weights(problem, weights)
     if range_weights is not None:
         problem = eqx.tree_at(
-            lambda p: p.network.ranges.weight, problem, jnp.asarray(range_weights)
+            lambda p: p.network.ranges.weight,
+            problem,
+            problem.network.ranges.weight * jnp.asarray(range_weights),
         )
     if link_weights is not None:
         problem = eqx.tree_at(lambda p: p.network.links.weight, problem, jnp.asarray(link_weights))

@@ -60,7 +60,7 @@ DETECTION: tuple[Entry, ...] = (
     ),
     Entry(
         "dark-current", "dark current draws the dim marks of a target", (70,),
-        _SHIFT, ("temperature",), ("linear", "quadratic"), "target",
+        _SHIFT, ("temperature", "neighbour"), ("linear", "quadratic", "doubling"), "target",
         (1e-5, 1e-1), "motion of the target", "cool the sensor; brighter marks",
         "Dark current doubles with every few kelvin and draws the measured centres of dim marks. "
         "The marks of a badly lit target shift together as the sensor warms.",
