@@ -151,7 +151,8 @@ def _of_quantity(driver: str, channels: Channels, lags: list[float]) -> list[Cou
             for tau in (0.4 * lags[0], lags[0], lags[2])
         ),
         Course(driver, "ageing", (), reference),
-        Course(driver, "doubling", (_DOUBLING,), reference),
+        # Over less it is as good as constant.
+        *([Course(driver, "doubling", (_DOUBLING,), reference)] if width > 0.5 * _DOUBLING else []),
         *(Course(driver, "turning", (times * span,), reference) for times in (4.0, 7.0, 15.0)),
         *(
             Course(driver, "staircase", (share * width, phase), reference)
