@@ -183,6 +183,8 @@ def test_the_body_of_a_camera_is_a_neighbour_of_what_does_not_carry_it():
     target = Scope(target=(scene.model.targets[0].name,))
     assert kinds(target) == ("neighbour",)
     assert kinds(target, "ambient_degC") == own
+    # What is called a body and is no camera's may be anything's.
+    assert kinds(target, "body_hull_degC") == own
     difference = "body_left_degC - ambient_degC"
     assert kinds(Scope(station=("bar",)), difference, "difference") == own
     assert "neighbour" in kinds(Scope(station=("other",)), difference, "difference")

@@ -65,7 +65,7 @@ def kinds_in_scope(kind: str, driver: str, scope: Scope, scene: Scene) -> tuple[
     if kind not in ("quantity", "difference", "own"):
         return tuple(kind.split(" or "))
     own = channel_kind(driver)
-    body = camera_of(driver)
+    body = camera_of(driver, scene)
     if not body or scope == Scope() or scope.rangefinder:
         return ("quantity", own)
     if scope.target:
@@ -78,16 +78,16 @@ def kinds_in_scope(kind: str, driver: str, scope: Scope, scene: Scene) -> tuple[
     return ("neighbour",) if logged else ("quantity", own, "neighbour")
 
 
-def camera_of(driver: str) -> str:
+def camera_of(driver: str, scene: Scene) -> str:
     """The camera whose body's temperature a driver is, alone or against the air's; or ""."""
     found = re.fullmatch(r"body_(.+?)_degC( - .*)?", driver)
-    return found[1] if found else ""
+    return found[1] if found and found[1] in {c.name for c in scene.model.cameras} else ""
 
 
 def air_is_logged(scene: Scene) -> bool:
     """Whether a temperature is logged that is not that of a camera."""
     channels = scene.network.channels.names
-    return any(channel_kind(c) == "temperature" and not camera_of(c) for c in channels)
+    return any(channel_kind(c) == "temperature" and not camera_of(c, scene) for c in channels)
 
 
 def enumerate_courses(scene: Scene) -> list[Course]:
@@ -104,7 +104,7 @@ def enumerate_courses(scene: Scene) -> list[Course]:
     return courses
 
 
-def courses_of_marks(courses: list[Course], n_marks: int) -> list[Course]:
+def courses_of_marks(scene: Scene, courses: list[Course], n_marks: int) -> list[Course]:
     """A mark sits wrongly always, from a moment on, ever more slowly, or with temperature."""
     slow = [
         [course for course in courses if course.driver == "time" and course.form == form]
@@ -117,7 +117,7 @@ def courses_of_marks(courses: list[Course], n_marks: int) -> list[Course]:
         and channel_kind(course.driver) == "temperature"
         and course.driver != OWN_BODY  # a mark belongs to no camera
     ]
-    warm = [course for course in warm if not camera_of(course.driver)] or warm
+    warm = [course for course in warm if not camera_of(course.driver, scene)] or warm
     every = math.ceil(max(n_marks * sum(map(len, slow)) / _MOST_OF_MARKS, 1.0))
     return [courses[0], *warm, *(course for own in slow for course in own[::every])]
 

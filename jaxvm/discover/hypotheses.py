@@ -246,7 +246,7 @@ def enumerate_hypotheses(scene: Scene) -> tuple[Family, ...]:
     by_bases = {n: [c for c in common if len(FORMS[c.form].bases) == n] for n in (1, 2)}
     constant = [Course("constant", "constant")]
     marks = marks_of(scene)
-    of_marks = courses_of_marks(courses, len({group.mark for group in marks}))
+    of_marks = courses_of_marks(scene, courses, len({group.mark for group in marks}))
     candidates = [
         (single, by_bases[1]),
         (single, by_bases[2]),
@@ -310,7 +310,8 @@ def _asked_of_names(scene: Scene, courses: list[Course]) -> dict[str, int]:
         )
         if bodies
     }
-    one |= {kind: one["target"] for kind in ("face", "mark")}
+    if model.targets:
+        one |= {"face": one["target"], "mark": one["target"]}
     distinct = {(course.driver, course.form): course for course in courses}
     kinds = {
         (kind, *named): kinds_in_scope(driver_kind(scene, named[0]), named[0], scope, scene)
@@ -359,7 +360,7 @@ def _follows(scene: Scene, scope: Scope, course: Course) -> bool:
     driver = course.driver
     if driver in (OWN_BODY, OWN_POWER_ON):
         return len(scope.camera) > 1
-    if scope.target and camera_of(driver) and course.form != "doubling":
+    if scope.target and camera_of(driver, scene) and course.form != "doubling":
         # Targets are as warm as the air. What doubles is the dark current of a camera.
         return not air_is_logged(scene)
     camera = driver.removeprefix("time since power-on of ")

@@ -237,10 +237,11 @@ def _adjusted(
     if weights is not None:
         problem = with_weights(problem, weights)
     if range_weights is not None:
+        # A range that says nothing stays without weight.
         problem = eqx.tree_at(
             lambda p: p.network.ranges.weight,
             problem,
-            problem.network.ranges.weight * jnp.asarray(range_weights),
+            replace_fn=lambda own: own * jnp.asarray(range_weights),
         )
     if link_weights is not None:
         problem = eqx.tree_at(lambda p: p.network.links.weight, problem, jnp.asarray(link_weights))
