@@ -191,6 +191,7 @@ def test_a_range_to_what_no_camera_sees_says_nothing():
     assert np.array_equal(
         np.flatnonzero(np.asarray(with_it.scene.network.ranges.weight) == 0.0), lone
     )
+    assert f"{len(lone)} ranges to targets" in with_it.summary()
     kept = np.delete(np.arange(len(ranges.epoch)), lone)
     fewer = type(ranges)(**{name: own[kept] for name, own in vars(ranges).items()})
     without = adjust(known.true_scene(replace(recording, ranges=fewer)), rtol=1e-10)
