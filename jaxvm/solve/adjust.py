@@ -114,11 +114,9 @@ class Adjustment:
             rms = pixel_rms(self.scene, residuals)
             pixels = [f"pixel RMS          {rms:.4f} px (weighted)"]
         ranges = self.scene.network.ranges
-        unplaced = 0 if ranges is None else int(np.sum(np.asarray(ranges.weight) == 0.0))
-        if unplaced:
-            pixels.append(
-                f"left out           {unplaced} ranges to targets that no camera sees then"
-            )
+        weight = np.ones(0) if ranges is None else np.asarray(ranges.weight)[: ranges.n_real]
+        if lost := int(np.sum(weight == 0.0)):
+            pixels.append(f"left out           {lost} ranges to targets that no camera sees then")
         return "\n".join(
             [
                 f"cost               {self.cost_before:.6g} -> {self.cost:.8g}",
