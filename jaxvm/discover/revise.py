@@ -82,7 +82,7 @@ def _better(
         kept = tuple(e for j, e in enumerate(effects) if j - given not in needless)
         tried = fit(scene.with_effects(kept, scene.room))
         new = [finding for j, finding in enumerate(new) if j not in needless]
-    new = _with_effects(new, tried)
+    new = with_effects(new, tried)
     variance = min(current.variance_factor, tried.variance_factor)
     gained = 2.0 * (current.cost - tried.cost) / variance
     cost = _complexity(new, variance, n) - _complexity(findings, variance, n)
@@ -91,7 +91,8 @@ def _better(
     return tried, new, k - sum(j < k for j in needless)
 
 
-def _with_effects(findings: list[Finding], fitted: Adjustment) -> list[Finding]:
+def with_effects(findings: list[Finding], fitted: Adjustment) -> list[Finding]:
+    """Findings with the values of a fit that has them all."""
     effects = fitted.scene.fitted_effects()[-len(findings) :]
     return [
         replace(finding, effect=effect, final_effect=effect)

@@ -13,7 +13,7 @@ from jaxvm.discover.hypotheses import FREE, Hypothesis, enumerate_hypotheses
 from jaxvm.discover.noise import LONGEST, memory, multipliers
 from jaxvm.discover.pairs import better_pair, of_other_places, worth_a_second_thought
 from jaxvm.discover.ranking import Ranking, noise_of, spread_of_constant, surprise
-from jaxvm.discover.revise import lost_without, prune, rename
+from jaxvm.discover.revise import lost_without, prune, rename, with_effects
 from jaxvm.discover.rivals import rivals
 from jaxvm.discover.scatter import ALIKE, likeness, of_each_image
 from jaxvm.discover.score import ScoreTests
@@ -97,6 +97,7 @@ class Search:
                 for candidate in pair:
                     self._take_as_given(candidate, progress)
                 self._search(most, progress)
+                self.findings = self._together()
         self._settle()
 
     def _search(self, most: int, progress: Callable[[str], None]) -> Ranking:
@@ -216,6 +217,16 @@ class Search:
         # What did not help before may help beside the new one.
         self._hopeless = set(self._superfluous)
         self.findings = self._confirmed()
+
+    def _together(self) -> list[Finding]:
+        """Findings with their values beside each other: the first of a pair was fitted alone."""
+        deviations = effect_deviations(self.current)[self.given :]
+        findings = with_effects(self.findings, self.current) if self.findings else []
+        return [
+            # An instant that no fit refines keeps the spread of those that did nearly as well.
+            replace(f, stds=tuple(new or old for new, old in zip(own, f.stds, strict=True)))
+            for f, own in zip(findings, deviations, strict=True)
+        ]
 
     def _as_good_on_heldout(self, candidate: Candidate) -> bool:
         shown = self.parts.evaluate(candidate.adjustment.scene)
