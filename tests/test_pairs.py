@@ -75,3 +75,4 @@ def test_a_narrow_name_alone_needs_no_second_thought():
     assert worth_a_second_thought([of(6, "wide")])
     assert worth_a_second_thought([of(1)])
     assert not worth_a_second_thought([of(24), of(1, "one")])
+    assert not worth_a_second_thought([of(1, "one")] * 5)

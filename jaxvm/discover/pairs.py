@@ -21,6 +21,9 @@ from jaxvm.solve.snooping import robust_variance
 WIDE = 4
 """Columns from which a single name is suspected to hold two effects."""
 
+MANY = 4
+"""Findings beyond which no pair explains as much."""
+
 _NARROW = 3
 _FIRST, _THEN = 4, 2
 """Names that are tried first, and companions of each."""
@@ -30,11 +33,11 @@ _HOPEFUL = 0.6
 
 
 def worth_a_second_thought(findings: list[Finding]) -> bool:
-    """Whether findings may be a pair of others: several, or one that is wide or has no name.
+    """Whether findings may be a pair of others: a few, or one that is wide or has no name.
 
-    Not after a free form.
+    Not after a free form, and where there are many no pair will do.
     """
-    if not findings or len(findings[0].effect.amplitudes) > FREE:
+    if not 0 < len(findings) <= MANY or len(findings[0].effect.amplitudes) > FREE:
         return False
     first = findings[0]
     doubtful = len(first.effect.amplitudes) >= WIDE or not first.hypothesis.entries
