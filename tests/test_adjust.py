@@ -23,7 +23,7 @@ from jaxvm.network.residual import residual
 from jaxvm.network.scene import build
 from jaxvm.physics.effects import Effect, Term
 from jaxvm.recording.model import Closure, Prior
-from jaxvm.recording.recording import uncorrelated
+from jaxvm.recording.recording import Links, uncorrelated
 from jaxvm.solve.adjust import adjust
 from jaxvm.solve.arrow import factorise
 from jaxvm.solve.covariance import standard_deviations
@@ -191,19 +191,48 @@ def test_a_range_to_what_no_camera_sees_says_nothing():
     assert np.array_equal(
         np.flatnonzero(np.asarray(with_it.scene.network.ranges.weight) == 0.0), lone
     )
-    assert f"{len(lone)} ranges to targets" in with_it.summary()
+    assert f"{len(lone)} ranges to or from what nothing places" in with_it.summary()
     kept = np.delete(np.arange(len(ranges.epoch)), lone)
     fewer = type(ranges)(**{name: own[kept] for name, own in vars(ranges).items()})
     without = adjust(known.true_scene(replace(recording, ranges=fewer)), rtol=1e-10)
     assert with_it.cost == pytest.approx(without.cost, rel=1e-9)
     assert with_it.degrees_of_freedom == without.degrees_of_freedom
-    # A target whose pose is given is somewhere, seen or not.
-    still = next(t for t in range(len(known.recording.model.targets)) if t != moving)
-    given = "pose" not in recording.model.targets[still].free
-    gone = type(obs)(**{name: own[obs.target != still] for name, own in vars(obs).items()})
-    scene = known.true_scene(replace(known.recording, observations=gone))
-    weight = np.asarray(scene.network.ranges.weight)[ranges.target == still]
-    assert given and weight.all()
+
+
+def test_a_range_to_what_is_given_linked_or_still_counts():
+    known = stereo_recording()
+    recording, obs, ranges = known.recording, known.recording.observations, known.recording.ranges
+    targets = recording.model.targets
+    moving = next(t for t, target in enumerate(targets) if target.motion != "static")
+    still = next(t for t in range(len(targets)) if t != moving)
+    assert "pose" not in targets[still].free
+
+    def weights(of, epoch=None, **changes):
+        unseen = (obs.target == of) & ((obs.epoch == epoch) | (epoch is None))
+        kept = type(obs)(**{name: own[~unseen] for name, own in vars(obs).items()})
+        scene = known.true_scene(replace(recording, observations=kept, **changes))
+        own = (ranges.target == of) & ((ranges.epoch == epoch) | (epoch is None))
+        return np.asarray(scene.network.ranges.weight)[own]
+
+    assert len(weights(moving, 2)) and not weights(moving, 2).any()
+    # Where its pose is given, it is somewhere, seen or not.
+    assert weights(still).all()
+    # One unknown pose for all epochs may be known by ranges alone.
+    free = replace(targets[still], free=frozenset({"pose"}))
+    model = replace(
+        recording.model, targets=[free if t == still else own for t, own in enumerate(targets)]
+    )
+    assert weights(still, model=model).all()
+    # A link to it in that epoch says where it is.
+    links = Links(
+        name=("tape",),
+        from_node=[("station", 0)],
+        to_node=[("target", moving)],
+        pose=np.zeros((1, 6)),
+        covariance=np.eye(6)[None],
+        epoch=np.array([2]),
+    )
+    assert weights(moving, 2, links=links).all()
 
 
 def test_ranges_give_scale():

@@ -10,8 +10,9 @@ import pytest
 from networks import matrix, stereo_recording, to_plane, to_point
 
 from jaxvm.discover.courses import driver_kind, kinds_in_scope
-from jaxvm.discover.hypotheses import Hypothesis, enumerate_hypotheses, member
+from jaxvm.discover.hypotheses import Hypothesis
 from jaxvm.discover.scatter import families_of_images
+from jaxvm.discover.space import enumerate_hypotheses, member
 from jaxvm.network.binding import in_scope, range_driver_table
 from jaxvm.network.residual import residual
 from jaxvm.network.scene import Scene, build

@@ -16,7 +16,7 @@ from pose_networks import network
 from processes import EIGHT, answer, apart, together
 from scipy.stats import chi2, kurtosis
 
-from jaxvm.discover.hypotheses import enumerate_hypotheses
+from jaxvm.discover.space import enumerate_hypotheses
 from jaxvm.montecarlo import (
     GaussNewton,
     LevenbergMarquardt,

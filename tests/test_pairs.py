@@ -8,10 +8,11 @@ import pytest
 from scenes import recorded
 
 from jaxvm.discover.diagnose import ROOM, _plain_fit
-from jaxvm.discover.hypotheses import FREE, enumerate_hypotheses
-from jaxvm.discover.pairs import WIDE, better_pair, of_other_places, worth_a_second_thought
+from jaxvm.discover.hypotheses import FREE
+from jaxvm.discover.pairs import WIDE, better_pair, other_beginnings, worth_a_second_thought
 from jaxvm.discover.score import ScoreTests
 from jaxvm.discover.select import refit, shortlist
+from jaxvm.discover.space import enumerate_hypotheses
 from jaxvm.network.scene import build
 from jaxvm.network.start import start
 from jaxvm.solve.snooping import robust_variance
@@ -49,7 +50,7 @@ def test_a_wide_name_gives_way_to_two_narrow_ones(two):
     one = refit(plain, wide[0], wide[2], parts)
     findings = [finding(plain, one)]
     assert worth_a_second_thought(findings)
-    others = of_other_places(ranking, plain, wide[0], parts.n)
+    others = other_beginnings(ranking, plain, wide[0], parts.n)
     pair = better_pair(plain, one.adjustment, findings, others, tests, parts)
     assert pair is not None
     names = [{entry.id for entry in candidate.hypothesis.entries} for candidate in pair]

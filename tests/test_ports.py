@@ -365,6 +365,18 @@ def _():
             leaning = Bench(origin=(x, y, Z), point=(0, 0, 0), target_turn=turn)
             yield Case(radius**2, middle, leaning, rtol=2e-3)
 
+    # On the axis it is f R^2 sin i cos i / Z^2 along the tilt; MATHEMATICS 1.9 has three of them.
+    for f, radius, z, degrees, published in (
+        (2500.0, 0.025, 2.0, 45.0, 0.195),
+        (2500.0, 0.010, 2.0, 30.0, 0.027),
+        (8000.0, 0.050, 20.0, 45.0, 0.025),
+    ):
+        i = np.radians(degrees)
+        leaning = Bench(origin=(0, 0, z), point=(0, 0, 0), target_turn=(i, 0, 0))
+        off = radius**2 * np.sin(i) * np.cos(i) / z**2
+        assert f * off == pytest.approx(published, abs=5e-4)
+        yield Case(radius**2, (CX, CY - F * off), leaning, rtol=1e-3)
+
 
 @hand("medium.bend_u", "rad/m")
 def _():

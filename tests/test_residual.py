@@ -353,6 +353,27 @@ def test_an_effect_of_no_size_changes_nothing():
     assert np.abs(of_flat(scene.state.flatten(), scene.network)).max() < 1e-8
 
 
+@pytest.mark.parametrize(("low", "high", "plane"), [(0.0, 0.05, 0.0), (-0.03, -0.01, -0.01)])
+def test_a_plate_with_posts_grows_about_its_plane(low, high, plane):
+    known = board_recording(noise=0.0)
+    (board,) = known.recording.model.targets
+    points = board.points.copy()
+    points[:, 2] = np.linspace(low, high, len(points))
+    model = replace(known.recording.model, targets=(replace(board, points=points),))
+    truth = known.truth | {"point": points}
+    scene = at_values(build(replace(known.recording, model=model)), truth)
+    e = 1e-3
+    grown = scene.with_effects((Effect("growth", (Term("target.scale"),), amplitudes=(e,)),))
+    middle = np.append(0.5 * (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)), plane)
+    by_hand = at_values(scene, {"point": middle + (1.0 + e) * (points - middle)})
+    n = 2 * len(known.recording.observations.epoch)
+    plain, got, expected = (
+        of_flat(s.state.flatten(), s.network)[:n] for s in (scene, grown, by_hand)
+    )
+    np.testing.assert_allclose(got, expected, atol=1e-9)
+    assert np.abs(got - plain).max() > 1.0
+
+
 def test_blocks_are_the_whole_table(exact):
     """Whether rows are computed in blocks or as one program under `jit`, they are the same."""
     _, scene = exact

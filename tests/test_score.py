@@ -8,10 +8,10 @@ import pytest
 from networks import dense_residuals, stereo_recording
 from test_steps import dense
 
-from jaxvm.discover.hypotheses import enumerate_hypotheses, member
 from jaxvm.discover.noise import multipliers
 from jaxvm.discover.ranking import surprise
 from jaxvm.discover.score import ScoreTests, _whitener
+from jaxvm.discover.space import enumerate_hypotheses, member
 from jaxvm.network.residual import residual
 from jaxvm.physics.drivers import OWN_BODY
 from jaxvm.physics.effects import Effect, Scope, Term

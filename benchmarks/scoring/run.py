@@ -53,9 +53,9 @@ def some(families, wanted: int):
 
 def one(epochs: int, wanted: list[int]) -> dict:
     """Times of scoring so many hypotheses on a scene of so many epochs, and of refitting one."""
-    from jaxvm.discover.hypotheses import enumerate_hypotheses, member
     from jaxvm.discover.noise import multipliers
     from jaxvm.discover.score import ScoreTests
+    from jaxvm.discover.space import enumerate_hypotheses, member
     from jaxvm.network.scene import build
     from jaxvm.network.start import start
     from jaxvm.recording import read_recording

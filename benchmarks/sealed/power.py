@@ -20,10 +20,10 @@ from scipy.spatial.transform import Rotation
 from jaxvm.discover.diagnose import ROOM
 from jaxvm.discover.gross import without_gross_errors
 from jaxvm.discover.heldout import Split, hold_out, split
-from jaxvm.discover.hypotheses import enumerate_hypotheses, member
 from jaxvm.discover.ranking import Ranking
 from jaxvm.discover.score import ScoreTests
 from jaxvm.discover.select import stacked
+from jaxvm.discover.space import enumerate_hypotheses, member
 from jaxvm.network.residual import whitening
 from jaxvm.network.scene import Scene, build
 from jaxvm.network.start import start

@@ -36,13 +36,13 @@ def sealed_key(folder: Path) -> tuple[list[dict], str]:
 
 def fingerprint() -> str:
     """Of the space of hypotheses and of power.py: what is cached is anew when they change."""
-    from jaxvm.discover import courses, groups, hypotheses
+    from jaxvm.discover import courses, groups, hypotheses, space
     from jaxvm.physics.catalogue import CATALOGUE
 
-    space = [(e.id, e.groups, e.drivers, e.forms, e.entity) for e in CATALOGUE]
-    modules = (hypotheses, courses, groups)
+    names = [(e.id, e.groups, e.drivers, e.forms, e.entity) for e in CATALOGUE]
+    modules = (hypotheses, space, courses, groups)
     sources = [*(Path(module.__file__) for module in modules), HERE / "power.py"]
-    text = repr(space).encode() + b"".join(source.read_bytes() for source in sources)
+    text = repr(names).encode() + b"".join(source.read_bytes() for source in sources)
     return hashlib.sha256(text).hexdigest()[:16]
 
 

@@ -1,18 +1,17 @@
 """Two effects in place of what was found first.
 
 A search that takes one effect after the other can begin with a name that has amplitudes enough to
-take a part of two, and what comes after is named for the remainder. So the leading names of other
+take a part of two, and what comes after is named for the remainder. So the other leading names and
 places get their turn: each with the best companion that it finds, against all that was found.
 """
 
 from collections.abc import Iterator
 
-import numpy as np
-
 from jaxvm.discover.diagnosis import Finding
 from jaxvm.discover.heldout import Split
 from jaxvm.discover.hypotheses import FREE, Hypothesis
 from jaxvm.discover.ranking import Ranking
+from jaxvm.discover.revise import complexity
 from jaxvm.discover.score import ScoreTests
 from jaxvm.discover.select import DECIDED, Candidate, price, refit, shortlist
 from jaxvm.solve.adjust import Adjustment
@@ -44,7 +43,7 @@ def worth_a_second_thought(findings: list[Finding]) -> bool:
     return len(findings) > 1 or doubtful
 
 
-def of_other_places(ranking: Ranking, plain: Adjustment, found: Hypothesis, n: int) -> list:
+def other_beginnings(ranking: Ranking, plain: Adjustment, found: Hypothesis, n: int) -> list:
     """The leading narrow hypothesis of each name and place, without what was found.
 
     Args:
@@ -84,7 +83,7 @@ def better_pair(
         plain: the fit without any of them.
         current: the fit with all findings.
         findings: what was found.
-        others: what to begin with instead (`of_other_places`).
+        others: what to begin with instead (`other_beginnings`).
         tests: of all hypotheses, at any fit.
         parts: what is fitted.
     """
@@ -94,14 +93,11 @@ def better_pair(
         drops = [2.0 * (plain.cost - pair[0].adjustment.cost)]
         drops.append(2.0 * (pair[0].adjustment.cost - pair[1].adjustment.cost))
         costs = [
-            price(c.hypothesis, drop, np.asarray(c.effect.amplitudes), variance, parts.n)
+            price(c.hypothesis, drop, c.amplitudes, variance, parts.n)
             for c, drop in zip(pair, drops, strict=True)
         ]
-        paid = sum(
-            price(f.hypothesis, f.drop, np.asarray(f.effect.amplitudes), variance, parts.n)
-            for f in findings
-        )
-        gained = 2.0 * (current.cost - pair[1].adjustment.cost) / variance - sum(costs) + paid
+        gained = 2.0 * (current.cost - pair[1].adjustment.cost) / variance
+        gained += complexity(findings, variance, parts.n) - sum(costs)
         if gained > least:
             best, least = pair, gained
     return best

@@ -6,7 +6,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import gammaln
 
-from jaxvm.discover.hypotheses import Family, Hypothesis, member
+from jaxvm.discover.hypotheses import Family, Hypothesis
+from jaxvm.discover.space import member
 from jaxvm.network.scene import Scene
 from jaxvm.physics.effects import Effect, Scope
 

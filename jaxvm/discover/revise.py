@@ -85,7 +85,7 @@ def _better(
     new = with_effects(new, tried)
     variance = min(current.variance_factor, tried.variance_factor)
     gained = 2.0 * (current.cost - tried.cost) / variance
-    cost = _complexity(new, variance, n) - _complexity(findings, variance, n)
+    cost = complexity(new, variance, n) - complexity(findings, variance, n)
     if not tried.converged or gained <= cost:
         return current, findings, k
     return tried, new, k - sum(j < k for j in needless)
@@ -93,14 +93,15 @@ def _better(
 
 def with_effects(findings: list[Finding], fitted: Adjustment) -> list[Finding]:
     """Findings with the values of a fit that has them all."""
-    effects = fitted.scene.fitted_effects()[-len(findings) :]
+    effects = fitted.scene.fitted_effects()
+    effects = effects[len(effects) - len(findings) :]
     return [
         replace(finding, effect=effect, final_effect=effect)
         for finding, effect in zip(findings, effects, strict=True)
     ]
 
 
-def _complexity(findings: list[Finding], variance: float, n: int) -> float:
+def complexity(findings: list[Finding], variance: float, n: int) -> float:
     """What the findings cost together."""
     return sum(
         price(f.hypothesis, f.drop, np.asarray(f.effect.amplitudes), variance, n) for f in findings

@@ -12,10 +12,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from jaxvm.discover.courses import Course
-from jaxvm.discover.hypotheses import Family, Hypothesis, member
+from jaxvm.discover.hypotheses import Family, Hypothesis
 from jaxvm.discover.ranking import Ranking
 from jaxvm.discover.score import ScoreTests
 from jaxvm.discover.select import DECIDED, log_prior, price_of_columns, stacked
+from jaxvm.discover.space import member
 from jaxvm.physics.effects import Effect
 from jaxvm.solve.adjust import Adjustment
 

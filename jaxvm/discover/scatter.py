@@ -1,8 +1,9 @@
 """What differs from image to image at random: a stabiliser, an autofocus, haze.
 
 No course in time explains it, and random signs of whole epochs leave it as large as it is: it is
-not among the hypotheses that are scored together. It shows in that neighbouring marks of one image
-move alike; then every image gets an amount of its own, judged by chi-square.
+not among the hypotheses that are scored together. Every image gets an amount of its own, judged by
+chi-square. That supposes noise that the marks of an image don't share: it is asked where
+neighbouring marks move clearly alike, or (a zoom) not at all, not where they move a little alike.
 """
 
 from collections.abc import Callable
@@ -11,9 +12,10 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from jaxvm.discover.groups import Group
-from jaxvm.discover.hypotheses import Family, Hypothesis, families_of
+from jaxvm.discover.hypotheses import Family, Hypothesis
 from jaxvm.discover.score import ScoreTests
 from jaxvm.discover.select import shortlist
+from jaxvm.discover.space import families_of
 from jaxvm.network.scene import Scene
 from jaxvm.physics.catalogue import CATALOGUE
 from jaxvm.physics.catalogue.entry import each

@@ -9,15 +9,16 @@ from jaxvm.discover.accept import Accepted, accept, short
 from jaxvm.discover.detail import with_detail
 from jaxvm.discover.diagnosis import Finding
 from jaxvm.discover.heldout import HeldOut, Split, gain
-from jaxvm.discover.hypotheses import FREE, Hypothesis, enumerate_hypotheses
+from jaxvm.discover.hypotheses import FREE, Hypothesis
 from jaxvm.discover.noise import LONGEST, memory, multipliers
-from jaxvm.discover.pairs import better_pair, of_other_places, worth_a_second_thought
+from jaxvm.discover.pairs import better_pair, other_beginnings, worth_a_second_thought
 from jaxvm.discover.ranking import Ranking, noise_of, spread_of_constant, surprise
 from jaxvm.discover.revise import lost_without, prune, rename, with_effects
 from jaxvm.discover.rivals import rivals
 from jaxvm.discover.scatter import ALIKE, likeness, of_each_image
 from jaxvm.discover.score import ScoreTests
 from jaxvm.discover.select import Candidate, identity, refit, shortlist, stacked
+from jaxvm.discover.space import enumerate_hypotheses
 from jaxvm.discover.waves import strongest_wave
 from jaxvm.physics.forms import FORMS
 from jaxvm.solve.adjust import Adjustment
@@ -89,15 +90,13 @@ class Search:
         first = self._search(most, progress)
         if worth_a_second_thought(self.findings):
             progress("trying pairs of other effects")
-            others = of_other_places(first, plain, self.findings[0].hypothesis, self.parts.n)
+            others = other_beginnings(first, plain, self.findings[0].hypothesis, self.parts.n)
             pair = better_pair(plain, self.current, self.findings, others, self._tests, self.parts)
             if pair is not None and self._as_good_on_heldout(pair[1]):
                 self.current, self.heldout, self.findings = plain, heldout, []
                 self._hopeless, self._superfluous = set(), set()
-                for candidate in pair:
-                    self._take_as_given(candidate, progress)
+                self._take_pair(pair, progress)
                 self._search(most, progress)
-                self.findings = self._together()
         self._settle()
 
     def _search(self, most: int, progress: Callable[[str], None]) -> Ranking:
@@ -218,33 +217,31 @@ class Search:
         self._hopeless = set(self._superfluous)
         self.findings = self._confirmed()
 
-    def _together(self) -> list[Finding]:
-        """Findings with their values beside each other: the first of a pair was fitted alone."""
-        deviations = effect_deviations(self.current)[self.given :]
-        findings = with_effects(self.findings, self.current) if self.findings else []
-        return [
-            # An instant that no fit refines keeps the spread of those that did nearly as well.
-            replace(f, stds=tuple(new or old for new, old in zip(own, f.stds, strict=True)))
-            for f, own in zip(findings, deviations, strict=True)
-        ]
-
     def _as_good_on_heldout(self, candidate: Candidate) -> bool:
         shown = self.parts.evaluate(candidate.adjustment.scene)
         return shown.rms_px <= _WORSE * self.heldout.rms_px
 
-    def _take_as_given(self, candidate: Candidate, progress: Callable[[str], None]) -> None:
-        """Take a hypothesis that was chosen already, as if it had led."""
-        self._score()
-        amplitudes = np.asarray(candidate.effect.amplitudes)
-        again = refit(self.current, candidate.hypothesis, amplitudes, self.parts)
-        if again is None or self.p_value > self.alpha:
-            return
-        shown = self.parts.evaluate(again.adjustment.scene)
-        proof = gain(self.heldout, shown, self.seed)
-        # What led beside it took parts of both, and is no rival.
-        leading = [(again.hypothesis, again.evidence, amplitudes)]
-        self._take(Accepted(again, (), shown, proof, (again,)), leading)
-        progress(f"found: {again.effect.name} ({again.effect.scope.words()})")
+    def _take_pair(self, pair, progress: Callable[[str], None]) -> None:
+        """Take hypotheses that were fitted already, as if each had led, while they are significant.
+
+        What led beside them took parts of both, and is no rival.
+        """
+        for candidate in pair:
+            self._score()
+            if self.p_value > self.alpha:
+                return
+            shown = self.parts.evaluate(candidate.adjustment.scene)
+            proof = gain(self.heldout, shown, self.seed)
+            leading = [(candidate.hypothesis, candidate.evidence, candidate.amplitudes)]
+            self._take(Accepted(candidate, (), shown, proof, (candidate,)), leading)
+            progress(f"found: {candidate.effect.name} ({candidate.effect.scope.words()})")
+        # The first was fitted without the second.
+        deviations = effect_deviations(self.current)[self.given :]
+        self.findings = [
+            # An instant that no fit refines keeps the spread of those that did nearly as well.
+            replace(f, stds=tuple(new or old for new, old in zip(own, f.stds, strict=True)))
+            for f, own in zip(with_effects(self.findings, self.current), deviations, strict=True)
+        ]
 
     def _finding(self, accepted: Accepted, leading) -> Finding:
         chosen, parts, current = accepted.chosen, self.parts, self.current

@@ -55,6 +55,11 @@ class Candidate:
         """The effect with its refitted values."""
         return self.adjustment.scene.fitted_effects()[-1]
 
+    @property
+    def amplitudes(self) -> np.ndarray:
+        """Its refitted amplitudes."""
+        return np.asarray(self.effect.amplitudes)
+
 
 def log_prior(hypothesis: Hypothesis, amplitudes: np.ndarray) -> float:
     """Log plausibility: named physics of a plausible size is preferred.

@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.stats import norm
 
-from jaxvm.discover.hypotheses import member
 from jaxvm.discover.ranking import Ranking
+from jaxvm.discover.space import member
 from jaxvm.network.scene import Scene
 from jaxvm.physics.ports import PORTS
 

@@ -20,6 +20,7 @@ from jaxvm.network.factors import (
     RangeFactor,
 )
 from jaxvm.network.tiles import Tiles
+from jaxvm.network.unknowns import placed_epochs
 from jaxvm.physics.blocks import rounded
 from jaxvm.physics.chain import Circumstances
 
@@ -171,7 +172,7 @@ class Tables:
         return RangeFactor(
             slots=jnp.asarray(np.concatenate(slots, axis=1)),
             sigma=jnp.asarray(ranges.sigma[:, None]),
-            weight=jnp.asarray(self._placed(ranges.target, ranges.epoch), float),
+            weight=jnp.asarray(self._placed(station, ranges.target, ranges.epoch), float),
             circumstances=self.circumstances(
                 ranges.epoch, ranges.target, point, np.zeros((n, 2)), np.ones(n), np.full(n, np.nan)
             ),
@@ -181,15 +182,15 @@ class Tables:
             pattern=jnp.zeros((n, 0)),
         )
 
-    def _placed(self, target, epoch) -> np.ndarray:
-        """Which ranges are to a target that is somewhere: given, seen, or ranged often enough.
-
-        One range to a target that no camera sees in that epoch says nothing of anything else.
-        """
-        obs, row = self.recording.observations, self.target_row[target, epoch]
-        given = np.array(["pose" not in t.free for t in self.model.targets])[target]
-        seen = np.isin(row, self.target_row[obs.target, obs.epoch])
-        return given | seen | (np.bincount(row)[row] >= 6)
+    def _placed(self, station, target, epoch) -> np.ndarray:
+        """Which ranges have an instrument and a target that are somewhere (`placed_epochs`)."""
+        placed, places = placed_epochs(self.scene), self.scene.station_places
+        # What the world carries is where it is.
+        stations = np.concatenate(
+            [placed["station"], np.ones((1, placed["station"].shape[1]), bool)]
+        )
+        carrier = np.array([places.get(t.station, -1) for t in self.model.targets], int)[target]
+        return stations[station, epoch] & stations[carrier, epoch] & placed["target"][target, epoch]
 
     def _carriers(self, target, epoch) -> np.ndarray:
         """Slots of what carries targets: their stations, or the world."""

@@ -131,7 +131,6 @@ def local_groups(layout: Layout, candidates: dict[str, np.ndarray], free: np.nda
 def free_unknowns(scene: Scene) -> Unknowns:
     """Free parameters of the engineer's model, plus all amplitudes and refinable constants."""
     model, layout = scene.model, scene.network.layout
-    n_epochs = len(scene.recording.time)
     free = np.zeros(layout.size, bool)
     tie = np.arange(layout.size)
     factor = np.ones(layout.size)
@@ -170,16 +169,13 @@ def free_unknowns(scene: Scene) -> Unknowns:
         ("station", model.stations, scene.station_row, "world_from_station"),
         ("target", model.targets, scene.target_row, "carrier_from_target"),
     ]
-    seen_of = _epochs_seen(scene)
+    placed = placed_epochs(scene)
     for kind, of_kind, rows, table in bodies:
         for i, body in enumerate(of_kind):
             if "pose" not in body.free:
                 continue
             moving = body.motion == "per-epoch"
-            seen = seen_of[kind][i]
-            for epoch in range(n_epochs) if moving else (0,):
-                if moving and not seen[epoch]:
-                    continue
+            for epoch in np.flatnonzero(placed[kind][i]) if moving else (0,):
                 slots = layout.slots(table, rows[i, epoch : epoch + 1])[0]
                 when = f" at epoch {ids[epoch]}" if moving else ""
                 release(slots, [f"{kind} {body.name}{when}: {p}" for p in pose_parts])
@@ -248,6 +244,20 @@ def _release_effects(scene: Scene, layout: Layout, release, factor, tie) -> np.n
     factor[constant] = np.asarray(scene.state.constant)[:-1]
     slots = np.concatenate([amplitude, constant])
     return slots[~busy[slots]]
+
+
+def placed_epochs(scene: Scene) -> dict[str, np.ndarray]:
+    """For stations and targets, whether they are anywhere in an epoch [body, epoch].
+
+    The pose of a body that moves freely is unknown where neither images nor links touch it: it is
+    no unknown of the adjustment then, and a range to it says nothing.
+    """
+    seen, model = _epochs_seen(scene), scene.model
+    return {
+        kind: seen[kind][: len(bodies)]
+        | np.array([b.motion != "per-epoch" or "pose" not in b.free for b in bodies], bool)[:, None]
+        for kind, bodies in (("station", model.stations), ("target", model.targets))
+    }
 
 
 def _epochs_seen(scene: Scene) -> dict[str, np.ndarray]:

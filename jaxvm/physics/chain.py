@@ -89,22 +89,6 @@ def mark(
     return grown + ports.axes("target.point")
 
 
-def centre_of_disc(
-    mark_cam: Float[Array, "3"], normal: Float[Array, "3"], ports: PortValues
-) -> Float[Array, "3"]:
-    """Point (m, camera coordinates) whose image is the centre of the image of a circular mark.
-
-    The image of a disc of radius R is an ellipse, and its centre is not the image of the disc's
-    centre. With Z the depth, n the plate's normal and e the axis of the camera it is that of a
-    point of the plate R^2 / Z (e - (e n) n) nearer (of second order in R / Z; the exact ellipse is
-    in Heikkila 2000, section 3). No mark shifts where the plate is parallel to the image.
-    """
-    if ports.plain:
-        return mark_cam
-    along = jnp.array([0.0, 0.0, 1.0]) - normal[2] * normal
-    return mark_cam - ports["target.disc"] / mark_cam[2] * along
-
-
 # --- structure and shutter ----------------------------------------------------------------------
 
 
@@ -193,6 +177,28 @@ def refract(mark_cam: Float[Array, "3"], ports: PortValues) -> Float[Array, "3"]
     return straight + distance * jnp.concatenate([across, along[None]])
 
 
+def centre_of_disc(
+    mark_cam: Float[Array, "3"],
+    world_from_target: tuple[Pose, Pose],
+    world_from_camera: tuple[Pose, Pose],
+    ports: PortValues,
+) -> Float[Array, "3"]:
+    """Point (m, camera coordinates) whose image is the centre of the image of a circular mark.
+
+    The image of a disc of radius R is an ellipse, and its centre is not the image of the disc's
+    centre. With Z the depth, n the plate's normal and e the axis of the camera it is that of a
+    point of the plate off by -R^2 / Z (e - (e n) n): to second order in R / Z what is f R^2 sin i
+    cos i / Z^2 on the axis (MATHEMATICS 1.9; Ahn, Warnecke and Kotowski 1999). No mark shifts where
+    the plate is parallel to the image. Poses are given as (carrier, body on the carrier).
+    """
+    if ports.plain:
+        return mark_cam
+    (carrier, target), (station, camera) = world_from_target, world_from_camera
+    axis = jnp.array([0.0, 0.0, 1.0])
+    normal = camera.unrotate(station.unrotate(carrier.rotate(target.rotate(axis))))
+    return mark_cam - ports["target.disc"] / mark_cam[2] * (axis - normal[2] * normal)
+
+
 # --- lens, sensor, detection --------------------------------------------------------------------
 
 
@@ -260,9 +266,8 @@ def predict_pixel(
     world = place(carrier, own, target, delay, at.velocity, ports)
     station, mounted = map(pose_from_vector, (sight.world_from_station, sight.station_from_camera))
     camera = look(station, mounted, world, ports)
-    facing = carrier.rotate(own.rotate(jnp.array([0.0, 0.0, 1.0])))
-    normal = mounted.unrotate(station.unrotate(facing))
-    apparent = refract(centre_of_disc(camera, normal, ports), ports)
+    centre = centre_of_disc(camera, (carrier, own), (station, mounted), ports)
+    apparent = refract(centre, ports)
     return expose(
         sight.focal, sight.centre, image(family, sight.distortion, apparent, ports), ports
     )

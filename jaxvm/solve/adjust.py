@@ -116,7 +116,7 @@ class Adjustment:
         ranges = self.scene.network.ranges
         weight = np.ones(0) if ranges is None else np.asarray(ranges.weight)[: ranges.n_real]
         if lost := int(np.sum(weight == 0.0)):
-            pixels.append(f"left out           {lost} ranges to targets that no camera sees then")
+            pixels.append(f"left out           {lost} ranges to or from what nothing places then")
         return "\n".join(
             [
                 f"cost               {self.cost_before:.6g} -> {self.cost:.8g}",
