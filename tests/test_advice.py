@@ -10,7 +10,7 @@ import pytest
 from networks import HELD, IMAGE, at_values, stereo_recording
 from scipy.spatial.transform import Rotation
 
-from jaxvm.discover.advice import _information, advise
+from jaxvm.discover.advice import _chances, _information, advise
 from jaxvm.discover.courses import Course
 from jaxvm.discover.groups import Group
 from jaxvm.discover.hypotheses import Hypothesis
@@ -18,6 +18,7 @@ from jaxvm.discover.plans import PLANS, Plan, planned, possible
 from jaxvm.geometry.targets import grid_points
 from jaxvm.network.residual import predict_pixels
 from jaxvm.network.scene import Scene, build
+from jaxvm.physics.catalogue.entry import each
 from jaxvm.physics.effects import Scope, Term
 from jaxvm.recording import (
     Camera,
@@ -157,6 +158,48 @@ def test_a_larger_effect_and_less_noise_decide_more(stereo):
         assert one.plan.key == two.plan.key
         assert two.gaps[0] == pytest.approx(one.gaps[0] / 4.0)
         assert one.odds == pytest.approx(np.exp(min(one.gaps[0] / 2.0, 60.0)))
+
+
+def test_rivals_beside_each_other_are_weighed_alone(stereo):
+    """More at once than the room holds, in any order: each has the gap that it has by itself."""
+    turn = rival("mount.turn_x", "body_degC", "linear", 20.0)
+    late = rival("sensor.cx", "time", "linear", 0.0)
+    parabola = rival("sensor.focal", "body_degC", "parabola", 20.0)
+    rivals = (SHIFT, turn, parabola, late)
+    assert stereo.room[0] < 1 + 5
+    plans = (PLAN["nearer"],)
+    (together,) = advise(stereo, ones(stereo), 0, rivals, 1.0, plans)
+    assert together.rivals == rivals
+    for k, one in enumerate(rivals):
+        (alone,) = advise(stereo, ones(stereo), 0, (one,), 1.0, plans)
+        assert together.gaps[k] == pytest.approx(alone.gaps[0], rel=1e-6, abs=1e-6)
+    # What contains the finding fits whatever is recorded.
+    assert together.gaps[2] < 0.05 < 1.0 < together.gaps[0]
+
+
+def test_what_has_no_room_is_not_weighed(stereo):
+    wide = Hypothesis(
+        Group(each("mark", "target.point_x", numbers=range(20)), "target"),
+        Course("constant", "constant"),
+        Scope(target=("plate",)),
+        (),
+    )
+    (advice,) = advise(stereo, ones(stereo), 0, (wide, SHIFT), 1.0, (PLAN["nearer"],))
+    assert advice.rivals == (SHIFT,)
+    assert advise(stereo, ones(stereo), 0, (wide,), 1.0, (PLAN["nearer"],)) == []
+
+
+@pytest.mark.parametrize(("log_odds", "gain"), [(0.0, 9.0), (4.0, 20.0), (-3.0, 30.0), (2.0, 0.1)])
+def test_the_chance_is_the_share_of_simulated_experiments(log_odds, gain):
+    """Two Gaussian hypotheses a distance sqrt(gain) apart, one measurement of unit variance."""
+    rng = np.random.default_rng(1)
+    n = 400_000
+    finding = rng.random(n) < 1.0 / (1.0 + np.exp(-0.5 * log_odds))
+    measured = np.where(finding, np.sqrt(gain), 0.0) + rng.normal(size=n)
+    shown = log_odds + measured**2 - (measured - np.sqrt(gain)) ** 2
+    apart = np.where(finding, shown, -shown) > 2.0 * np.log(20.0)
+    (got,) = _chances(np.array([log_odds]), np.array([gain]))
+    assert got == pytest.approx(apart.mean(), abs=0.004)
 
 
 # --- one camera before a frontal plate: closed forms ----------------------------------------------

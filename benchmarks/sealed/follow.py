@@ -5,7 +5,8 @@
 Takes scored recordings (`solve.py`, `score.py`) in which a finding has doubles and advice. The
 world makes the same scene again under the plan that was named best, `jaxvm diagnose FIRST --with
 SECOND` sees the two and nothing else, and the key tells whether the doubles came apart: the right
-name first, and no other name left in its set. Writes DIR/follow.json and prints a table.
+name first, and of no pair that the plan promised to part both names left in its set. Stricter is
+*alone*: no other name at all is left there. Writes DIR/follow.json and prints a table.
 """
 
 import argparse
@@ -23,11 +24,12 @@ from score import sealed_key
 from solve import copy_recording, environment
 from world import record
 
-from jaxvm.discover.select import DECIDED
-
 
 def asked(folder: Path, entries: list[dict]) -> list[dict]:
-    """Cases: recordings whose leading double has a plan that promises to decide."""
+    """Cases: recordings that have a finding with doubles and a plan to part them.
+
+    Of several findings in one recording the first whose plan is said to decide.
+    """
     cases = []
     for entry in entries:
         file = folder / "reports" / entry["id"] / "report.json"
@@ -35,23 +37,24 @@ def asked(folder: Path, entries: list[dict]) -> list[dict]:
             continue
         for finding in json.loads(file.read_text())["findings"]:
             best = next(iter(finding["advice"]), None)
-            if best is None or not finding["equivalents"]:
+            if best is None:
                 continue
-            gaps = [gap for gap in best["gaps"] if gap is not None]
-            cases.append(
-                {
-                    "entry": entry,
-                    "plan": best["plan"],
-                    "expected_gap": min(gaps, default=0.0),
-                    "before": _names(finding),
-                }
-            )
-            break
+            before = _names(finding)
+            ids = {c["physics"]: _name(c) for c in claims(finding)}
+            rivals = {ids[name] for name in best["rivals"]} - {before[0]}
+            if best["decides"] and rivals:
+                told = {"plan": best["plan"], "chance": min(best["chances"])}
+                cases.append({"entry": entry, "before": before, "rivals": sorted(rivals)} | told)
+                break
     return cases
 
 
 def _names(finding: dict) -> list[str]:
-    return list(dict.fromkeys(c["catalogue_id"] or c["physics"] for c in claims(finding)))
+    return list(dict.fromkeys(_name(claim) for claim in claims(finding)))
+
+
+def _name(claim: dict) -> str:
+    return claim["catalogue_id"] or claim["physics"]
 
 
 def follow(folder: Path, case: dict) -> dict:
@@ -74,11 +77,12 @@ def follow(folder: Path, case: dict) -> dict:
         report = json.loads(file.read_text())
         shutil.rmtree(work / "report")
     known = json.loads((folder / "score-cache" / f"{entry['id']}.json").read_text())
-    return case | outcome(entry, report, Facts(**known["shown"]["facts"]))
+    return case | outcome(case, report, Facts(**known["shown"]["facts"]))
 
 
-def outcome(entry: dict, report: dict, facts: Facts) -> dict:
-    """Whether the right name stands alone after both recordings."""
+def outcome(case: dict, report: dict, facts: Facts) -> dict:
+    """Whether the right name comes first after both recordings, and what is left beside it."""
+    entry = case["entry"]
     right = [
         finding
         for finding in report["findings"]
@@ -93,10 +97,13 @@ def outcome(entry: dict, report: dict, facts: Facts) -> dict:
         )
         for finding in right
     ]  # fmt: skip
+    pairs = [{case["before"][0], rival} for rival in case["rivals"]]
+    parted = [not any(pair <= set(_names(finding)) for pair in pairs) for finding in right]
     return {
         "after": [_names(finding) for finding in report["findings"]],
         "right": bool(right),
-        "apart": any(alone),
+        "apart": any(a or p for a, p in zip(alone, parted, strict=True)),
+        "alone": any(alone),
     }
 
 
@@ -109,7 +116,7 @@ def main() -> None:
     folder = options.folder.resolve()
     entries, _ = sealed_key(folder)
     cases = asked(folder, entries)[: options.count]
-    print(f"{len(cases)} recordings have doubles and advice", flush=True)
+    print(f"{len(cases)} recordings have doubles and a plan that is said to decide", flush=True)
     results = []
     with ThreadPoolExecutor(options.jobs) as pool:
         for case in pool.map(lambda c: follow(folder, c), cases):
@@ -118,10 +125,12 @@ def main() -> None:
             results.append(case)
             state = case.get("failed") or ("apart" if case["apart"] else case["after"])
             words = f"{case['id']}  {case['hidden']}  {case['before']}  {case['plan']}"
-            print(f"{words}  (gap {case['expected_gap']:.3g}): {state}", flush=True)
-    promised = [c for c in results if c["expected_gap"] >= DECIDED and "failed" not in c]
-    apart = sum(c["apart"] for c in promised)
-    print(f"{apart} of {len(promised)} doubles that the advice promised to separate came apart")
+            print(f"{words}  ({case['chance']:.0%}): {state}", flush=True)
+    done = [case for case in results if "failed" not in case]
+    apart, alone = (sum(case[key] for case in done) for key in ("apart", "alone"))
+    expected = sum(case["chance"] for case in done)
+    print(f"{apart} of {len(done)} that were promised to come apart did ({expected:.1f} expected),")
+    print(f"{alone} of them to the right name alone")
     (folder / "follow.json").write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
 
 

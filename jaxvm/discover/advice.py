@@ -6,25 +6,33 @@ amplitudes of the finding (columns C), B the other unknowns and R the columns of
 
     lambda (1 - rho^2) = a^T (N_CC - N_CP N_PP^-1 N_PC) a,    P = B and R,
 
-is the expected gap in chi-square between the finding and the rival (MATHEMATICS 1.8); exp(gap / 2)
-are the odds that it brings.
+is the expected gap in chi-square between the finding and the rival (MATHEMATICS 1.8). What the
+first recording has shown is known. A further one that adds d to the gap makes of the log odds l (on
+the scale of chi-square) a normal variable of variance 4 d and of mean l + d where the finding is
+right, l - d where the rival is.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from scipy.special import ndtr
 
 from jaxvm.discover.hypotheses import Hypothesis
 from jaxvm.discover.plans import PLANS, Plan, planned, possible
 from jaxvm.discover.select import DECIDED
 from jaxvm.network.scene import Scene
-from jaxvm.physics.effects import Effect, room_for
-from jaxvm.physics.forms import FORMS
+from jaxvm.physics.effects import room_for
 from jaxvm.solve.adjust import with_weights
 from jaxvm.solve.arrow import Arrow, factorise
 from jaxvm.solve.problem import normal_at, scene_problem
+
+PROMISED = 0.95
+"""Chance of coming apart from which on a plan is said to decide."""
+
+_SURE = 0.99
 
 
 @dataclass(frozen=True)
@@ -35,11 +43,13 @@ class Advice:
         plan: the further recording.
         rivals: what the finding may be mistaken for.
         gaps: expected gap in chi-square to each rival, of both recordings together.
+        chances: that finding and rival come apart at 20:1, whichever of the two is right.
     """
 
     plan: Plan
     rivals: tuple[Hypothesis, ...]
     gaps: tuple[float, ...]
+    chances: tuple[float, ...]
 
     @property
     def odds(self) -> float:
@@ -47,59 +57,97 @@ class Advice:
         return float(np.exp(min(0.5 * min(self.gaps), 60.0)))
 
     @property
+    def chance(self) -> float:
+        """Of the rival that is hardest to tell apart."""
+        return min(self.chances)
+
+    @property
     def decides(self) -> bool:
-        """Whether all rivals would be told apart at 20:1."""
-        return min(self.gaps) >= DECIDED
+        """Whether all rivals are likely to be told apart at 20:1."""
+        return self.chance >= PROMISED
 
 
 def advise(
     scene: Scene,
     weights: tuple[np.ndarray, ...],
     place: int,
-    rivals: tuple[Hypothesis, ...],
+    rivals: Sequence[Hypothesis],
     variance: float,
     plans: tuple[Plan, ...] = PLANS,
+    log_odds: Sequence[float] | None = None,
 ) -> list[Advice]:
     """Plans by what they bring for telling a finding from its rivals, best first.
 
-    Plans that bring nearly the same (beyond a sure decision) keep the order of their cost.
+    Plans that are as good as sure to decide keep the order of their cost.
 
     Args:
         scene: the last model, fitted.
         weights: of its observations.
         place: number of the finding among the effects of the scene.
-        rivals: what it may be mistaken for.
+        rivals: what it may be mistaken for; those with more amplitudes than the scene has room for
+            are left out.
         variance: of unit weight.
         plans: further recordings to weigh.
+        log_odds: twice the natural log of the odds for the finding against each rival, as they
+            stand; even without.
     """
-    pairs = [(rival, _with_rival(scene, rival)) for rival in rivals]
-    # A rival for which there is no room would need programs of its own; it is left out.
-    pairs = [(rival, with_rival) for rival, with_rival in pairs if with_rival.room == scene.room]
-    if not pairs:
+    batches = _batches(scene, rivals)
+    kept = [k for _, numbers in batches for k in numbers]
+    if not kept:
         return []
-    rivals, own = (tuple(part) for part in zip(*pairs, strict=True))
-    now = [_information(with_rival, weights) for with_rival in own]
-    found = []
+    even = np.zeros(len(rivals)) if log_odds is None else np.array(log_odds)
+
+    def gaps(bound: Scene, own: tuple[np.ndarray, ...], known: list[np.ndarray]):
+        """Gaps to all rivals, and the information of every batch that they come from."""
+        found, total = [], []
+        for (with_rivals, numbers), before in zip(batches, known, strict=True):
+            again = bound.with_effects(with_rivals.fitted_effects(), scene.room)
+            total.append(before + _information(again, own))
+            first = len(with_rivals.effects) - len(numbers)
+            found += [_gap(with_rivals, place, k, first, total[-1]) for k in range(len(numbers))]
+        return np.array(found) / variance, total
+
+    present, known = gaps(scene, weights, [np.zeros(())] * len(batches))
+    advices = []
     for plan in plans:
-        if not possible(plan, scene.recording):
-            continue
-        gaps = []
-        further = planned(plan, scene)
-        for with_rival, present in zip(own, now, strict=True):
-            room = with_rival.room
-            bound = further.scene.with_effects(with_rival.fitted_effects(), room)
-            total = present + _information(bound, further.weights)
-            gaps.append(_gap(with_rival, place, total) / variance)
-        found.append(Advice(plan, rivals, tuple(gaps)))
-    sure = 2.0 * DECIDED
-    return sorted(found, key=lambda advice: -min(min(advice.gaps), sure))
+        if possible(plan, scene.recording):
+            further = planned(plan, scene)
+            expected, _ = gaps(further.scene, further.weights, known)
+            chances = _chances(even[kept], np.maximum(expected - present, 0.0))
+            own = tuple(rivals[k] for k in kept)
+            advices.append(Advice(plan, own, tuple(expected.tolist()), tuple(chances.tolist())))
+    return sorted(advices, key=lambda advice: -min(advice.chance, _SURE))
 
 
-def _with_rival(scene: Scene, rival: Hypothesis) -> Scene:
-    """The scene with a rival as its last effect, at amplitude zero."""
-    columns = len(rival.group.terms) * len(FORMS[rival.course.form].bases)
-    effects: tuple[Effect, ...] = (*scene.fitted_effects(), rival.effect(np.zeros(columns)))
-    return scene.with_effects(effects, room_for(effects, scene.room))
+def _batches(scene: Scene, rivals: Sequence[Hypothesis]) -> list[tuple[Scene, list[int]]]:
+    """The scene with rivals at amplitude zero after its effects, as many at once as have room.
+
+    One that has no room alone is left out: it would need programs of its own.
+    """
+    present = scene.fitted_effects()
+    new = [rival.effect(np.zeros(rival.effect(()).n_columns)) for rival in rivals]
+
+    def together(numbers: list[int]):
+        return (*present, *(new[k] for k in numbers))
+
+    def has_room(numbers: list[int]) -> bool:
+        return room_for(together(numbers), scene.room) == scene.room
+
+    batches: list[list[int]] = []
+    for k in range(len(rivals)):
+        if batches and has_room([*batches[-1], k]):
+            batches[-1].append(k)
+        elif has_room([k]):
+            batches.append([k])
+    return [(scene.with_effects(together(own), scene.room), own) for own in batches]
+
+
+def _chances(log_odds: np.ndarray, gain: np.ndarray) -> np.ndarray:
+    """Chance that log odds end beyond DECIDED for the one of two hypotheses that is right."""
+    spread = 2.0 * np.sqrt(np.maximum(gain, 1e-9))
+    own = 1.0 / (1.0 + np.exp(-0.5 * log_odds))
+    right, wrong = (ndtr((s * log_odds + gain - DECIDED) / spread) for s in (1.0, -1.0))
+    return own * right + (1.0 - own) * wrong
 
 
 def _information(scene: Scene, weights: tuple[np.ndarray, ...]) -> np.ndarray:
@@ -128,15 +176,24 @@ def _reduced(hessian: Arrow):
     return (scaled.shared - tall.T @ tall) / (a[:, None] * a)
 
 
-def _gap(scene: Scene, place: int, information: np.ndarray) -> float:
-    """Expected gap between the finding at `place` and the last effect of the scene."""
+def _gap(scene: Scene, place: int, rival: int, first: int, information: np.ndarray) -> float:
+    """Expected gap between the finding at `place` and one of the rivals at the end of a scene.
+
+    Args:
+        scene: with rivals.
+        place: number of the finding among its effects.
+        rival: number of the rival among the rivals.
+        first: place of the first rival.
+        information: of the shared unknowns.
+    """
     layout, column = scene.network.layout, scene.unknowns.column
-    columns, constants = scene.places()[place]
-    own = column[layout.all("amplitude")[columns]]
-    amplitude = np.asarray(scene.state.amplitude)[columns]
-    left_out = set(own) | set(column[layout.all("constant")[constants]])
+    columns = [column[layout.all("amplitude")[own]] for own, _ in scene.places()]
+    constants = [column[layout.all("constant")[own]] for _, own in scene.places()]
+    absent = {place, *range(first, len(columns))} - {first + rival}
+    left_out = {k for number in absent for k in (*columns[number], *constants[number])}
     diagonal = np.diag(information)
     other = np.array([k for k in range(len(information)) if k not in left_out and diagonal[k] > 0])
+    own, amplitude = columns[place], np.asarray(scene.state.amplitude)[scene.places()[place][0]]
     scale = 1.0 / np.sqrt(diagonal[other])
     block = scale[:, None] * information[np.ix_(other, other)] * scale
     cross = scale[:, None] * information[np.ix_(other, own)]

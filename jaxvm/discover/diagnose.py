@@ -36,8 +36,6 @@ from jaxvm.solve.snooping import robust_variance
 ROOM = (16, 8)
 """Columns and constants kept free for effects to be found."""
 
-_ADVISED = 3
-
 
 def diagnose(
     recording: Recording,
@@ -122,14 +120,19 @@ def diagnose(
 
 
 def _with_advice(final: Adjustment, finding: Finding, place: int, parts: Split) -> Finding:
-    """A finding with the further recordings that would tell it from its leading rivals."""
+    """A finding with the further recordings that would tell it from its rivals."""
     # Another name for the same course, and what contains it, fits whatever is recorded further.
-    own = finding.hypothesis
-    others = [r.hypothesis for r in finding.rivals if not r.hypothesis.contains(own)]
-    leading = tuple(others[:_ADVISED])
-    if not leading:
-        return finding
-    found = advise(final.scene, parts.sound, place, leading, final.variance_factor)
+    others = [r for r in finding.rivals if not r.hypothesis.contains(finding.hypothesis)]
+    found = advise(
+        final.scene,
+        parts.sound,
+        place,
+        [r.hypothesis for r in others],
+        final.variance_factor * finding.noise[0],
+        log_odds=[
+            2.0 * float(np.log(max(finding.weight, 1e-9) / rival.weight)) for rival in others
+        ],
+    )
     return replace(finding, advice=tuple(found))
 
 

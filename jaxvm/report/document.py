@@ -86,7 +86,9 @@ def _finding(finding: Finding) -> dict[str, Any]:
             {
                 "plan": advice.plan.key,
                 "words": advice.plan.words,
-                "gaps": [gap for gap in advice.gaps],
+                "rivals": [rival.effect(()).name for rival in advice.rivals],
+                "gaps": list(advice.gaps),
+                "chances": list(advice.chances),
                 "odds": min(advice.odds, 1e12),
                 "decides": bool(advice.decides),
             }

@@ -185,9 +185,9 @@ def separate_by(finding: Finding) -> str:
     """The recording that would tell it from its doubles."""
     if finding.advice:
         best = finding.advice[0]
-        nearest = int(np.argmin(best.gaps))
-        rival = best.rivals[nearest].effect(()).name
-        return f"record {best.plan.words}: expected odds {odds(best.odds)} against “{rival}”"
+        rival = best.rivals[int(np.argmin(best.chances))].effect(()).name
+        told = f"expected odds {odds(best.odds)}, a chance of {best.chance:.0%} to tell it from"
+        return f"record {best.plan.words}: {told} “{rival}”"
     entries = finding.hypothesis.entries
     return entries[0].separate_by if entries else "another driver's range, another geometry"
 
