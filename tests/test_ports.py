@@ -363,7 +363,7 @@ def _():
             off = np.linalg.solve([[2.0 * a, c], [c, 2.0 * b]], [-d, -e])
             middle = seen(x, y, Z) + F * off * radius / Z
             leaning = Bench(origin=(x, y, Z), point=(0, 0, 0), target_turn=turn)
-            yield Case(radius**2, middle, leaning, rtol=2e-3)
+            yield Case(radius**2, middle, leaning, rtol=1e-6)
 
     # On the axis it is f R^2 sin i cos i / Z^2 along the tilt; MATHEMATICS 1.9 has three of them.
     for f, radius, z, degrees, published in (

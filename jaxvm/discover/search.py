@@ -367,15 +367,25 @@ class Search:
         """A finding's weights where something is left: it may be that of which this is a part.
 
         What is left need not be significant among all hypotheses; at the finding's own ports, or in
-        its harmonics, it speaks against the course that was named. So does the same name for the
-        same body twice. And a free form fits what has another name, or none, as well as its own.
+        its harmonics, it speaks against the course that was named. So does another finding at the
+        same ports of the same body: one course that has no name is easily taken for two. A free
+        form fits what has another name, or none, as well as its own, and what it does not fit quite
+        is a smaller finding that has a name.
         """
         effect = finding.effect
-        left = self.ranking.left_at({term.port for term in effect.terms}, effect.scope)
+        ports = {term.port for term in effect.terms}
+        left = self.ranking.left_at(ports, effect.scope)
         left = min(left, self.ranking.left_in_harmonics(effect))
-        alike = [f for f in self.findings if identity(f.hypothesis) == identity(finding.hypothesis)]
-        free = len(effect.amplitudes) > FREE
-        if self.p_value > self.alpha and left > DOUBTFUL and len(alike) == 1 and not free:
+        shared = any(
+            f is not finding
+            and f.effect.scope == effect.scope
+            and ports & {term.port for term in f.effect.terms}
+            for f in self.findings
+        )
+        free = any(
+            len(f.effect.amplitudes) > FREE and f.drop >= finding.drop for f in self.findings
+        )
+        if self.p_value > self.alpha and left > DOUBTFUL and not shared and not free:
             return finding
         sure = 1.0 - DOUBT
         others = tuple(replace(r, weight=sure * r.weight) for r in finding.rivals)

@@ -186,10 +186,11 @@ def centre_of_disc(
     """Point (m, camera coordinates) whose image is the centre of the image of a circular mark.
 
     The image of a disc of radius R is an ellipse, and its centre is not the image of the disc's
-    centre. With Z the depth, n the plate's normal and e the axis of the camera it is that of a
-    point of the plate off by -R^2 / Z (e - (e n) n): to second order in R / Z what is f R^2 sin i
-    cos i / Z^2 on the axis (MATHEMATICS 1.9; Ahn, Warnecke and Kotowski 1999). No mark shifts where
-    the plate is parallel to the image. Poses are given as (carrier, body on the carrier).
+    centre: with Z the depth, n the plate's normal and e the axis of the camera it is that of the
+    point off by -R^2 / Z (e - (e n) n). That is exact for a pinhole (the polar of the image's line
+    at infinity in the dual conic c c^T - R^2 (I - n n^T)), and on the axis f R^2 sin i cos i / Z^2
+    to first order (MATHEMATICS 1.9; Ahn, Warnecke and Kotowski 1999). What a lens distorts across
+    the mark itself is left out. Poses are given as (carrier, body on the carrier).
     """
     if ports.plain:
         return mark_cam
