@@ -15,6 +15,7 @@ from jaxvm.discover.courses import Course
 from jaxvm.discover.groups import Group
 from jaxvm.discover.hypotheses import Hypothesis
 from jaxvm.discover.plans import PLANS, Plan, planned, possible
+from jaxvm.discover.select import DECIDED
 from jaxvm.geometry.targets import grid_points
 from jaxvm.network.residual import predict_pixels
 from jaxvm.network.scene import Scene, build
@@ -197,8 +198,8 @@ def test_the_chance_is_the_share_of_simulated_experiments(log_odds, gain):
     finding = rng.random(n) < 1.0 / (1.0 + np.exp(-0.5 * log_odds))
     measured = np.where(finding, np.sqrt(gain), 0.0) + rng.normal(size=n)
     shown = log_odds + measured**2 - (measured - np.sqrt(gain)) ** 2
-    apart = np.where(finding, shown, -shown) > 2.0 * np.log(20.0)
-    (got,) = _chances(np.array([log_odds]), np.array([gain]))
+    apart = np.where(finding, shown, -shown) > DECIDED
+    (got,) = _chances(np.array([log_odds]), np.array([gain]), DECIDED)
     assert got == pytest.approx(apart.mean(), abs=0.004)
 
 

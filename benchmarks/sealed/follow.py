@@ -33,7 +33,8 @@ def asked(folder: Path, entries: list[dict]) -> list[dict]:
     cases = []
     for entry in entries:
         file = folder / "reports" / entry["id"] / "report.json"
-        if not file.exists() or not entry["hidden"]:
+        known = [truth for truth in entry["hidden"] if not truth["outside"]]
+        if not file.exists() or not known:
             continue
         for finding in json.loads(file.read_text())["findings"]:
             best = next(iter(finding["advice"]), None)

@@ -22,7 +22,7 @@ from scipy.special import ndtr
 
 from jaxvm.discover.hypotheses import Hypothesis
 from jaxvm.discover.plans import PLANS, Plan, planned, possible
-from jaxvm.discover.select import DECIDED
+from jaxvm.discover.select import decisive_gap
 from jaxvm.network.scene import Scene
 from jaxvm.physics.effects import room_for
 from jaxvm.solve.adjust import with_weights
@@ -98,22 +98,25 @@ def advise(
     even = np.zeros(len(rivals)) if log_odds is None else np.array(log_odds)
 
     def gaps(bound: Scene, own: tuple[np.ndarray, ...], known: list[np.ndarray]):
-        """Gaps to all rivals, and the information of every batch that they come from."""
-        found, total = [], []
+        """Gaps to all rivals, the drop of the finding, and the information of every batch."""
+        found, total, drop = [], [], 0.0
         for (with_rivals, numbers), before in zip(batches, known, strict=True):
             again = bound.with_effects(with_rivals.fitted_effects(), scene.room)
             total.append(before + _information(again, own))
             first = len(with_rivals.effects) - len(numbers)
-            found += [_gap(with_rivals, place, k, first, total[-1]) for k in range(len(numbers))]
-        return np.array(found) / variance, total
+            rest = range(first, len(with_rivals.effects))
+            found += [_gap(with_rivals, place, {*rest} - {k}, total[-1]) for k in rest]
+            drop = _gap(with_rivals, place, {*rest}, total[-1])
+        return np.array(found) / variance, drop / variance, total
 
-    present, known = gaps(scene, weights, [np.zeros(())] * len(batches))
+    present, _, known = gaps(scene, weights, [np.zeros(())] * len(batches))
     advices = []
     for plan in plans:
         if possible(plan, scene.recording):
             further = planned(plan, scene)
-            expected, _ = gaps(further.scene, further.weights, known)
-            chances = _chances(even[kept], np.maximum(expected - present, 0.0))
+            expected, drop, _ = gaps(further.scene, further.weights, known)
+            gain = np.maximum(expected - present, 0.0)
+            chances = _chances(even[kept], gain, decisive_gap(drop))
             own = tuple(rivals[k] for k in kept)
             advices.append(Advice(plan, own, tuple(expected.tolist()), tuple(chances.tolist())))
     return sorted(advices, key=lambda advice: -min(advice.chance, _SURE))
@@ -142,11 +145,11 @@ def _batches(scene: Scene, rivals: Sequence[Hypothesis]) -> list[tuple[Scene, li
     return [(scene.with_effects(together(own), scene.room), own) for own in batches]
 
 
-def _chances(log_odds: np.ndarray, gain: np.ndarray) -> np.ndarray:
-    """Chance that log odds end beyond DECIDED for the one of two hypotheses that is right."""
+def _chances(log_odds: np.ndarray, gain: np.ndarray, needed: float) -> np.ndarray:
+    """Chance that log odds end beyond a limit for the one of two hypotheses that is right."""
     spread = 2.0 * np.sqrt(np.maximum(gain, 1e-9))
     own = 1.0 / (1.0 + np.exp(-0.5 * log_odds))
-    right, wrong = (ndtr((s * log_odds + gain - DECIDED) / spread) for s in (1.0, -1.0))
+    right, wrong = (ndtr((s * log_odds + gain - needed) / spread) for s in (1.0, -1.0))
     return own * right + (1.0 - own) * wrong
 
 
@@ -176,23 +179,22 @@ def _reduced(hessian: Arrow):
     return (scaled.shared - tall.T @ tall) / (a[:, None] * a)
 
 
-def _gap(scene: Scene, place: int, rival: int, first: int, information: np.ndarray) -> float:
-    """Expected gap between the finding at `place` and one of the rivals at the end of a scene.
+def _gap(scene: Scene, place: int, absent: set[int], information: np.ndarray) -> float:
+    """Drop of chi-square by a finding that neither the model nor other effects take.
 
     Args:
-        scene: with rivals.
-        place: number of the finding among its effects.
-        rival: number of the rival among the rivals.
-        first: place of the first rival.
+        scene: with rivals after its effects.
+        place: number of the finding among the effects.
+        absent: numbers of effects that are not in the model.
         information: of the shared unknowns.
     """
     layout, column = scene.network.layout, scene.unknowns.column
     columns = [column[layout.all("amplitude")[own]] for own, _ in scene.places()]
     constants = [column[layout.all("constant")[own]] for _, own in scene.places()]
-    absent = {place, *range(first, len(columns))} - {first + rival}
-    left_out = {k for number in absent for k in (*columns[number], *constants[number])}
+    left_out = {k for e in {place, *absent} for k in (*columns[e], *constants[e])}
     diagonal = np.diag(information)
-    other = np.array([k for k in range(len(information)) if k not in left_out and diagonal[k] > 0])
+    other = [k for k in range(len(information)) if k not in left_out and diagonal[k] > 0]
+    other = np.array(other, int)
     own, amplitude = columns[place], np.asarray(scene.state.amplitude)[scene.places()[place][0]]
     scale = 1.0 / np.sqrt(diagonal[other])
     block = scale[:, None] * information[np.ix_(other, other)] * scale

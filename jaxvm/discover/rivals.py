@@ -15,7 +15,7 @@ from jaxvm.discover.courses import Course
 from jaxvm.discover.hypotheses import Family, Hypothesis
 from jaxvm.discover.ranking import Ranking
 from jaxvm.discover.score import ScoreTests
-from jaxvm.discover.select import DECIDED, log_prior, price_of_columns, stacked
+from jaxvm.discover.select import DECIDED, decisive_gap, log_prior, price_of_columns, stacked
 from jaxvm.discover.space import member
 from jaxvm.physics.effects import Effect
 from jaxvm.solve.adjust import Adjustment
@@ -24,13 +24,6 @@ MOST, PLACES = 8, 3
 """Names that are kept, and places of each."""
 
 _ODDS = 20.0
-
-_COARSE = 1e-3
-"""Share of an effect's drop that its form leaves open.
-
-No effect follows its driver quite as a form says. Where chi-square runs to ten thousands the
-remainder outweighs any odds between rivals that differ by less than that.
-"""
 
 
 @dataclass(frozen=True)
@@ -90,7 +83,7 @@ def rivals(
     change = stacked(before) - stacked(after)
     full = float(np.sum(change**2)) / variance
     # The gap that decides, and by how much smaller ones are shrunk.
-    limit = DECIDED + _COARSE * full
+    limit = decisive_gap(full)
     shrunk = DECIDED / limit
     claims: dict[tuple, _Claim] = {}
     own_amplitudes = np.asarray(effect.amplitudes)

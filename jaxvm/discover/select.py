@@ -21,6 +21,13 @@ from jaxvm.solve.adjust import Adjustment, adjust
 DECIDED = 2.0 * np.log(20.0)
 """Gap in chi-square at which one hypothesis is twenty times as likely as another."""
 
+_COARSE = 1e-3
+"""Share of an effect's drop that its form leaves open.
+
+No effect follows its driver quite as a form says. Where chi-square runs to ten thousands the
+remainder outweighs any odds between rivals that differ by less than that.
+"""
+
 CLEAR = 15.0
 """Difference of foretold evidence between two courses of the same terms that a refit won't turn."""
 
@@ -59,6 +66,11 @@ class Candidate:
     def amplitudes(self) -> np.ndarray:
         """Its refitted amplitudes."""
         return np.asarray(self.effect.amplitudes)
+
+
+def decisive_gap(drop):
+    """Gap in chi-square at which one of two hypotheses is out that explain an effect of a drop."""
+    return DECIDED + _COARSE * drop
 
 
 def log_prior(hypothesis: Hypothesis, amplitudes: np.ndarray) -> float:
