@@ -122,9 +122,18 @@ def dense_jacobian(problem, x):
     )(x)
 
 
-def test_the_predicted_gap_is_the_difference_of_refits(stereo):
-    """Noise-free recordings, the present and the planned one, fitted with the rival instead."""
-    (advice,) = advise(stereo, ones(stereo), 0, (SHIFT,), 1.0, (PLAN["farther"],))
+@pytest.mark.parametrize(("driver", "amplitude"), [("body_degC", AMPLITUDE), ("time", 5e-8)])
+def test_the_predicted_gap_is_the_difference_of_refits(stereo, driver, amplitude):
+    """Noise-free recordings, the present and the planned one, fitted with the rival instead.
+
+    What goes with time has gone on for a day before the second.
+    """
+    reference = 20.0 if driver == "body_degC" else 0.0
+    right = rival("sensor.focal", driver, "linear", reference)
+    wrong = rival("mount.shift_z", driver, "linear", reference)
+    stereo = stereo.with_effects((right.effect((amplitude,)),), ROOM)
+    stereo = at_pixels(stereo, with_pixels(stereo))
+    (advice,) = advise(stereo, ones(stereo), 0, (wrong,), 1.0, (PLAN["farther"],))
     (gap,) = advice.gaps
     further = planned(PLAN["farther"], stereo)
     used = np.zeros(len(stereo.recording.observations.epoch), bool)
@@ -140,14 +149,14 @@ def test_the_predicted_gap_is_the_difference_of_refits(stereo):
     state["carrier_from_target"] = np.concatenate([targets[0], targets[1][1:]])
     plain = at_values(build(both), state)
     found = {}
-    for name, hypothesis in (("true", FOCAL), ("rival", SHIFT)):
+    for name, hypothesis in (("true", right), ("rival", wrong)):
         fitted = adjust(plain.with_effects((hypothesis.effect((0.0,)),), ROOM), check=False)
         assert fitted.converged, fitted.why
         found[name] = 2.0 * fitted.cost
     assert gap > 10.0
     assert found["rival"] - found["true"] == pytest.approx(gap, rel=0.1)
     # What the present recording alone brings is less.
-    alone = adjust(stereo.with_effects((SHIFT.effect((0.0,)),), ROOM), check=False)
+    alone = adjust(stereo.with_effects((wrong.effect((0.0,)),), ROOM), check=False)
     assert 2.0 * alone.cost < 0.9 * gap
 
 

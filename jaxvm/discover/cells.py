@@ -22,6 +22,8 @@ from jaxvm.solve.reduced import half_rows, packet_of_rows
 class Cells:
     """Residuals and tangents of a fitted scene, arranged in cells.
 
+    Rows of a cell are one component of all its observations after the other.
+
     Attributes:
         tangent: derivative of the whitened residuals with respect to each port.
         residual: whitened residuals.
@@ -72,8 +74,13 @@ class Arrangement:
         self, values: Float[np.ndarray, "observations components"]
     ) -> Float[np.ndarray, "cells rows"]:
         """A vector over all observations in the shape of the residuals of the cells."""
-        padded = np.concatenate([values, np.zeros((1, self.components))])
-        return padded[self.rows].reshape(self.cells.residual.shape)
+        return _by_component([values], self.rows, self.components)
+
+    def of_cells(
+        self, values: Float[np.ndarray, "n observations"]
+    ) -> Float[np.ndarray, "n cells width"]:
+        """One number for each observation where its cell has it; zero in the padding."""
+        return gathered(values, self.rows)
 
 
 def gathered(
@@ -132,23 +139,18 @@ def arrange(adjustment: Adjustment) -> Arrangement:
         views.append(np.asarray(factor.view)[:n])
         epoch = views[-1] % len(scene.recording.time)
         keys.append(np.stack([group, epoch, entity], axis=1))
-        pad = [(0, 0), (0, components - r.shape[1])]
-        residuals.append(np.pad(np.asarray(r)[:n], pad))
-        for parts, own in ((halves, half), (tangents, tangent)):
-            parts.append(np.pad(np.asarray(own)[:n], [*pad, (0, 0)]))
+        for parts, own in ((residuals, r), (halves, half), (tangents, tangent)):
+            parts.append(np.asarray(own)[:n])
     key = np.concatenate(keys)
     distinct, cell = np.unique(key, axis=0, return_inverse=True)
     rows = padded_lists(cell.ravel(), len(distinct), len(key))
 
-    def in_cells(parts):
-        values = np.concatenate(parts)
-        values = np.concatenate([values, np.zeros((1, *values.shape[1:]))])[rows]
-        return values.reshape(len(distinct), rows.shape[1] * components, *values.shape[3:])
-
+    tangent = _by_component(tangents, rows, components)
     cells = Cells(
-        tangent=np.moveaxis(in_cells(tangents), 2, 0),
-        residual=in_cells(residuals),
-        half=in_cells(halves),
+        # What is read of one port at a time lies together.
+        tangent=np.ascontiguousarray(np.moveaxis(tangent, 2, 0)),
+        residual=_by_component(residuals, rows, components),
+        half=_by_component(halves, rows, components),
         group=padded_lists(distinct[:, 0], n_groups, len(distinct)),
         group_of=np.where(distinct[:, 0] < 0, n_groups, distinct[:, 0]),
         epoch_of=distinct[:, 1],
@@ -163,6 +165,23 @@ def arrange(adjustment: Adjustment) -> Arrangement:
         tuple(starts),
         components,
     )
+
+
+def _by_component(
+    parts: list[np.ndarray], rows: Int[np.ndarray, "cells width"], components: int
+) -> Float[np.ndarray, "cells rows ..."]:
+    """Values [observations, components, ...] of tables in cells; zero where a table has fewer."""
+    rest = parts[0].shape[2:]
+    values = np.zeros((components, sum(map(len, parts)) + 1, *rest))
+    first = 0
+    for part in parts:
+        here = slice(first, first + len(part))
+        values[: part.shape[1], here] = np.swapaxes(part, 0, 1)
+        first += len(part)
+    found = np.empty((len(rows), components, rows.shape[1], *rest))
+    for component, own in enumerate(values):
+        found[:, component] = own[rows]
+    return found.reshape(len(rows), components * rows.shape[1], *rest)
 
 
 def padded_lists(label: np.ndarray, n_labels: int, filler: int) -> np.ndarray:

@@ -16,11 +16,14 @@ from scipy.spatial.transform import Rotation
 from jaxvm.network.residual import predict_pixels
 from jaxvm.network.scene import Scene, build
 from jaxvm.recording import Drivers, Recording
+from jaxvm.recording.join import PAUSE_S
 
 
 @dataclass(frozen=True)
 class Plan:
     """One kind of further recording.
+
+    It is made on another day: what went on with time has gone on since.
 
     Attributes:
         key: stable name.
@@ -28,12 +31,14 @@ class Plan:
         poses: changes the poses [targets, epochs, 6] of the targets that move, from the middles of
             their marks (target coordinates), the eye that sees them and the upward direction.
         recording: changes the circumstances (drivers, velocities, power).
+        anew: whether it begins where the first began: clocks start anew.
     """
 
     key: str
     words: str
     poses: Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray] | None = None
     recording: Callable[[Recording], Recording] | None = None
+    anew: bool = False
 
 
 @dataclass(frozen=True)
@@ -163,7 +168,7 @@ PLANS: tuple[Plan, ...] = (
     Plan("cycle", "a faster cycle of heating and cooling that returns", recording=_cycle),
     Plan("reverse", "the motion the other way and twice as fast", recording=_reversed),
     Plan("restart", "the cameras switched off and on again in the middle", recording=_restarted),
-    Plan("longer", "the same for twice as long", recording=_longer),
+    Plan("longer", "the same for twice as long", recording=_longer, anew=True),
 )
 """Further recordings that are weighed, in the order of their cost."""
 
@@ -198,6 +203,8 @@ def planned(plan: Plan, scene: Scene) -> Planned:
         lambda s: (s.amplitude, s.constant), state, (blank.amplitude, blank.constant)
     )
     changed = replace(changed, state=state)
+    if not plan.anew:
+        changed = _on_another_day(changed)
     changed = changed.with_effects(scene.fitted_effects(), scene.room)
     sizes = np.array([c.image_size for c in scene.model.cameras], float)
     camera = recording.observations.camera
@@ -209,6 +216,18 @@ def planned(plan: Plan, scene: Scene) -> Planned:
         inside = (own > 0.0) & (own < sizes[camera[rows]] - 1.0)
         weights.append((inside.all(axis=1) & _in_front(changed, rows)).astype(float))
     return Planned(changed, tuple(weights))
+
+
+def _on_another_day(scene: Scene) -> Scene:
+    """The same scene with its clock as after the first recording and the pause before the next."""
+    channels = scene.network.channels
+    if "time" not in channels.names:
+        return scene
+    row = channels.index("time")
+    later = scene.recording.time[-1] - scene.recording.time[0] + PAUSE_S
+    values = channels.values.at[row].add(later)
+    network = eqx.tree_at(lambda n: n.channels.values, scene.network, values)
+    return replace(scene, network=network)
 
 
 def _eye(scene: Scene) -> np.ndarray:

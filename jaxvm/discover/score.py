@@ -165,26 +165,29 @@ class ScoreTests:
 
         What is multiplied stays in the cache, and what all groups share is read once for some.
         """
-        cells, arrangement, groups = self.arrangement.cells, self.arrangement, iter(family.groups)
+        cells, groups = self.arrangement.cells, iter(family.groups)
         n, height = residual.shape
-        index = np.repeat(arrangement.rows, arrangement.components, axis=1)
+        by_component = n, self.arrangement.components, -1
         while some := tuple(islice(groups, _STACKED)):
             terms = [(group, term) for group in some for term in group.terms]
             ends = np.cumsum([len(group.terms) for group in some])
-            own = [self._pattern(term, group.mark) for group, term in terms]
-            different = {id(values): values for values in own}
-            ports = [PORT_INDEX[term.port] for _, term in terms]
+            own = [
+                (
+                    cells.tangent[PORT_INDEX[term.port]].reshape(by_component),
+                    self._pattern(term, group.mark)[:, None],
+                )
+                for group, term in terms
+            ]
             product = np.empty((n, len(terms)))
             halves = np.empty((n, len(terms), cells.half.shape[2])) if full else None
             square = [np.empty((n, len(group.terms), len(group.terms))) for group in some]
-            stack = np.empty((_CELLS, len(terms), height))
+            stack = np.empty((_CELLS, len(terms), *own[0][0].shape[1:]))
             for first in range(0, n, _CELLS):
                 here = slice(first, min(first + _CELLS, n))
-                piece = stack[: min(_CELLS, n - first)]
-                patterns = {at: values[index[here]] for at, values in different.items()}
-                for k, (values, port) in enumerate(zip(own, ports, strict=True)):
-                    tangent = cells.tangent[port, here]
-                    np.multiply(tangent, patterns[id(values)], out=piece[:, k])
+                apart = stack[: min(_CELLS, n - first)]
+                for k, (tangent, pattern) in enumerate(own):
+                    np.multiply(tangent[here], pattern[here], out=apart[:, k])
+                piece = apart.reshape(*apart.shape[:2], height)
                 product[here] = (piece @ residual[here, :, None])[:, :, 0]
                 if halves is not None:
                     np.matmul(piece, cells.half[here], out=halves[here])
@@ -196,8 +199,8 @@ class ScoreTests:
                 half = None if halves is None else halves[:, at]
                 yield _Tangents(cells.n_local, square[g], half, product[:, at])
 
-    def _pattern(self, term, mark: tuple[int, int] | None) -> Float[np.ndarray, " observations_1"]:
-        """Pattern of a term over all observations, of one mark or of all; a zero at the end."""
+    def _pattern(self, term, mark: tuple[int, int] | None) -> Float[np.ndarray, "cells width"]:
+        """Pattern of a term over the observations of all cells, of one mark or of all."""
         own = self._patterns[_key(term)]
         own = own if mark is None else own * self._mark_mask(mark)
         return own if term.weight == 1.0 else term.weight * own
@@ -212,17 +215,16 @@ class ScoreTests:
                         alike.setdefault((term.driver, term.basis), {})[_key(term)] = term
         for terms in alike.values():
             values = np.asarray(patterns(tuple(terms.values()), self.arrangement.drivers))
-            ended = np.concatenate([values.T, np.zeros((len(terms), 1))], axis=1)
-            self._patterns.update(zip(terms, ended, strict=True))
+            self._patterns.update(zip(terms, self.arrangement.of_cells(values.T), strict=True))
 
-    def _mark_mask(self, mark: tuple[int, int]) -> np.ndarray:
+    def _mark_mask(self, mark: tuple[int, int]) -> Float[np.ndarray, "cells width"]:
         obs, arrangement = self.scene.recording.observations, self.arrangement
-        own = np.zeros(len(arrangement.drivers) + 1)
+        own = np.zeros(len(arrangement.drivers))
         for start, rows in zip(arrangement.starts, self.scene.tables, strict=False):
             own[start : start + len(rows)] = (obs.target[rows] == mark[0]) & (
                 obs.point[rows] == mark[1]
             )
-        return own
+        return arrangement.of_cells(own)
 
 
 @dataclass(frozen=True)

@@ -86,6 +86,7 @@ class Scene:
         sigma_px, sigma_m: noise of a pixel coordinate and of a range.
         tells_power: whether the engineer noted when cameras were switched on.
         restart_s: when all cameras were switched on again, or None.
+        began_s: how long after the plain recording began; what goes with time has gone on.
     """
 
     kind: str
@@ -107,4 +108,5 @@ class Scene:
     priors: list[dict] = field(default_factory=list)
     tells_power: bool = False
     restart_s: float | None = None
+    began_s: float = 0.0
     with_finder: bool = False

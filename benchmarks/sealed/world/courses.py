@@ -195,7 +195,9 @@ def warm_up(site):
 
 
 def _of_time(function, when, t0=None, constants=None, driver="time", plain=True):
-    return Course(lambda v: function(v.t), driver, when, t0, constants or {}, plain)
+    return Course(
+        lambda v: function(v.t + v.scene.began_s), driver, when, t0, constants or {}, plain
+    )
 
 
 def onset(site, start=None):

@@ -111,6 +111,9 @@ def record(kind, seed, hidden=(), plan=None, size="normal"):
     )  # fmt: skip
     usual = _build(kind, seed, None, size, needs)
     scene = usual if plan is None else _build(kind, seed, plan, size, needs)
+    if plan not in (None, "longer"):
+        # On the next day; what is recorded for longer is the same once more, from the start.
+        scene.began_s = float(usual.t[-1]) + 86_400.0
     places = stream(kind, seed, "missing" if plan is None else f"missing {plan}")
     usual_rows = chain.all_rows(usual)
     effects = _draw_all(usual, usual_rows, hidden)
