@@ -8,9 +8,10 @@ import pytest
 from networks import dense_residuals, stereo_recording
 from test_steps import dense
 
+from jaxvm.discover.battery import Part, Place
 from jaxvm.discover.noise import multipliers
 from jaxvm.discover.ranking import surprise
-from jaxvm.discover.score import ScoreTests, _whitener
+from jaxvm.discover.score import ScoreTests, _Tangents, _whitener
 from jaxvm.discover.space import enumerate_hypotheses, member
 from jaxvm.network.residual import residual
 from jaxvm.physics.drivers import OWN_BODY
@@ -128,3 +129,23 @@ def test_rounding_of_what_is_absorbed_stops_nothing():
     assert np.allclose(found[0].T @ found[0], np.linalg.inv(sound), rtol=1e-6)
     inverse = (axes[:, :3] / [1.0, 0.3, 0.1]) @ axes[:, :3].T
     assert np.allclose(found[1].T @ found[1], inverse, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("n_bases", [1, 3])
+def test_products_of_many_terms_are_those_of_few(n_bases):
+    """Very many terms keep their tangents, few their products cell by cell: the same sums."""
+    rng = np.random.default_rng(4)
+    cells, terms, rows = np.arange(3, 90), 7, 5
+    stack = rng.normal(size=(100, terms, rows))
+    square = stack @ np.swapaxes(stack, 1, 2)
+    place = Place(cells, np.zeros((0, 1), int), np.zeros((0, 1), int))
+    part = Part(0, np.arange(2), place, rng.normal(size=(2, n_bases, len(cells))))
+    product = np.zeros((100, terms))
+    few = _Tangents(0, square, None, None, product)
+    many = _Tangents(0, None, stack, None, product)
+    np.testing.assert_allclose(many.gram(part), few.gram(part), atol=1e-10)
+    np.testing.assert_allclose(many.sizes(cells), few.sizes(cells), rtol=1e-12)
+    # Term by term: column (k, i) is the tangent of term k times base i.
+    columns = np.einsum("nkr,in->kinr", stack[cells], part.weights[1])
+    columns = columns.reshape(terms * n_bases, -1)
+    np.testing.assert_allclose(few.gram(part)[1], columns @ columns.T, atol=1e-10)

@@ -127,10 +127,9 @@ def main() -> None:
             state = case.get("failed") or ("apart" if case["apart"] else case["after"])
             words = f"{case['id']}  {case['hidden']}  {case['before']}  {case['plan']}"
             print(f"{words}  ({case['chance']:.0%}): {state}", flush=True)
-    done = [case for case in results if "failed" not in case]
-    apart, alone = (sum(case[key] for case in done) for key in ("apart", "alone"))
-    expected = sum(case["chance"] for case in done)
-    print(f"{apart} of {len(done)} that were promised to come apart did ({expected:.1f} expected),")
+    apart, alone = (sum(case.get(key, False) for case in results) for key in ("apart", "alone"))
+    number, expected = len(results), sum(case["chance"] for case in results)
+    print(f"{apart} of {number} that were promised to come apart did ({expected:.1f} expected),")
     print(f"{alone} of them to the right name alone")
     (folder / "follow.json").write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
 

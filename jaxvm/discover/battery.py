@@ -17,8 +17,8 @@ from jaxvm.network.scene import Scene
 from jaxvm.physics.effects import Scope, evaluate
 from jaxvm.physics.forms import BASIS_INDEX, FORMS
 
-_MOST_PRODUCTS = 6_000_000
-"""Numbers that products of the weights within groups may take: 48 MB."""
+MOST_PRODUCTS = 6_000_000
+"""Numbers that products within groups, of weights or of tangents, may take: 48 MB."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Part:
     def within(self) -> Float[np.ndarray, "b bases bases groups_width_width"] | None:
         """Products of the weights of two cells of a group; None where they would be too many."""
         b, n_bases, _ = self.weights.shape
-        if b * n_bases**2 * self.place.group.size * self.place.group.shape[1] > _MOST_PRODUCTS:
+        if b * n_bases**2 * self.place.group.size * self.place.group.shape[1] > MOST_PRODUCTS:
             return None
         own = gathered(self._flat, self.place.group).reshape(b, n_bases, *self.place.group.shape)
         return np.einsum("bigv,bjgw->bijgvw", own, own).reshape(b, n_bases, n_bases, -1)

@@ -26,7 +26,7 @@ from itertools import islice
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxvm.discover.battery import Battery, Part, battery
+from jaxvm.discover.battery import MOST_PRODUCTS, Battery, Part, battery
 from jaxvm.discover.cells import Arrangement, Cells, arrange, gathered
 from jaxvm.discover.hypotheses import Family
 from jaxvm.discover.ranking import Ranking, Scores, surprise
@@ -180,24 +180,28 @@ class ScoreTests:
             ]
             product = np.empty((n, len(terms)))
             halves = np.empty((n, len(terms), cells.half.shape[2])) if full else None
-            square = [np.empty((n, len(group.terms), len(group.terms))) for group in some]
-            stack = np.empty((_CELLS, len(terms), *own[0][0].shape[1:]))
+            # Of very many terms the products would take more room than the tangents.
+            wide = family.n_terms > height
+            square = [] if wide else [np.empty((n, *2 * (family.n_terms,))) for _ in some]
+            stack = np.empty((n if wide else _CELLS, len(terms), *own[0][0].shape[1:]))
             for first in range(0, n, _CELLS):
                 here = slice(first, min(first + _CELLS, n))
-                apart = stack[: min(_CELLS, n - first)]
+                apart = stack[here] if wide else stack[: min(_CELLS, n - first)]
                 for k, (tangent, pattern) in enumerate(own):
                     np.multiply(tangent[here], pattern[here], out=apart[:, k])
                 piece = apart.reshape(*apart.shape[:2], height)
                 product[here] = (piece @ residual[here, :, None])[:, :, 0]
                 if halves is not None:
                     np.matmul(piece, cells.half[here], out=halves[here])
-                    for g, end in enumerate(ends):
-                        group = piece[:, end - square[g].shape[1] : end]
-                        np.matmul(group, np.swapaxes(group, 1, 2), out=square[g][here])
+                    for products, end in zip(square, ends, strict=False):
+                        group = piece[:, end - family.n_terms : end]
+                        np.matmul(group, np.swapaxes(group, 1, 2), out=products[here])
             for g, end in enumerate(ends):
-                at = slice(end - square[g].shape[1], end)
+                at = slice(end - family.n_terms, end)
                 half = None if halves is None else halves[:, at]
-                yield _Tangents(cells.n_local, square[g], half, product[:, at])
+                own_stack = stack[:, at].reshape(n, family.n_terms, height) if wide else None
+                products = None if wide else square[g]
+                yield _Tangents(cells.n_local, products, own_stack, half, product[:, at])
 
     def _pattern(self, term, mark: tuple[int, int] | None) -> Float[np.ndarray, "cells width"]:
         """Pattern of a term over the observations of all cells, of one mark or of all."""
@@ -267,13 +271,15 @@ class _Tangents:
 
     Attributes:
         n_local: columns of `halves` that belong to local unknowns.
-        square: among themselves.
+        square: among themselves; None where they are so many that
+        stack: the tangents themselves take less room.
         halves: with J L^-T; None where they are not wanted.
         product: with the residuals.
     """
 
     n_local: int
-    square: Float[np.ndarray, "cells terms terms"]
+    square: Float[np.ndarray, "cells terms terms"] | None
+    stack: Float[np.ndarray, "cells terms rows"] | None
     halves: Float[np.ndarray, "cells terms halves"] | None
     product: Float[np.ndarray, "cells terms"]
 
@@ -281,6 +287,38 @@ class _Tangents:
         """What the shared unknowns see of each course."""
         assert self.halves is not None
         return _summed(part, _at(self.halves[:, :, self.n_local :], part.place.cells))
+
+    def gram(self, part: Part) -> Float[np.ndarray, "b columns columns"]:
+        """Products of each course's columns, term by term."""
+        weights, cells = part.weights, part.place.cells
+        b, n_bases, n = weights.shape
+        k = self.product.shape[1]
+        if self.square is None:
+            assert self.stack is not None
+            gram = np.zeros((b, k * n_bases, k * n_bases))
+            for first in range(0, n, _CELLS):
+                here = slice(first, first + _CELLS)
+                piece = np.swapaxes(self.stack[cells[here]], 0, 1)  # k n rows
+                for own, course in zip(gram, weights[:, :, here], strict=True):
+                    columns = (piece[:, None] * course[:, :, None]).reshape(k * n_bases, -1)
+                    own += columns @ columns.T
+            return gram
+        square = _at(self.square, cells)
+        if n_bases == 1:
+            return ((weights[:, 0] ** 2) @ square.reshape(n, k * k)).reshape(b, k, k)
+        gram = np.empty((b, k, n_bases, k, n_bases))
+        for i in range(k):
+            for j in range(i + 1):
+                both = (weights * square[:, i, j]) @ np.swapaxes(weights, 1, 2)
+                gram[:, i, :, j] = gram[:, j, :, i] = both
+        return gram.reshape(b, k * n_bases, k * n_bases)
+
+    def sizes(self, cells: np.ndarray) -> Float[np.ndarray, " n"]:
+        """Sum of squares of all tangents in each cell."""
+        if self.square is None:
+            assert self.stack is not None
+            return np.einsum("nkr,nkr->n", self.stack, self.stack)[cells]
+        return np.einsum("nkk->n", self.square)[cells]
 
 
 def _key(term: Term) -> tuple:
@@ -315,26 +353,18 @@ def _information(
     Few large matrix products, in NumPy: a compiled program for every shape of a family would take
     longer to make than to run.
     """
-    weights, place, d = part.weights, part.place, tangents.n_local
-    square = _at(tangents.square, place.cells)
-    b, n_bases, n = weights.shape
-    k = square.shape[1]
+    place, d = part.place, tangents.n_local
+    b, n_bases, _ = part.weights.shape
+    k = tangents.product.shape[1]
     columns = k * n_bases
-    if n_bases == 1:
-        gram = ((weights[:, 0] ** 2) @ square.reshape(n, k * k)).reshape(b, k, k)
-    else:
-        gram = np.empty((b, k, n_bases, k, n_bases))
-        for i in range(k):
-            for j in range(i + 1):
-                both = (weights * square[:, i, j]) @ np.swapaxes(weights, 1, 2)
-                gram[:, i, :, j] = gram[:, j, :, i] = both
-        gram = gram.reshape(b, columns, columns)
+    gram = tangents.gram(part)
     information = gram - shared @ np.swapaxes(shared, 1, 2)
     if d:
         assert tangents.halves is not None
         own = _at(tangents.halves[:, :, :d], place.cells)
         padded = np.concatenate([own, np.zeros((1, k, d))])[place.group]
-        if part.within is not None:
+        few = place.group.size * place.group.shape[1] * k**2 <= MOST_PRODUCTS
+        if few and part.within is not None:
             alike = np.einsum("gvkd,gwld->gvwkl", padded, padded, optimize=True)
             taken = part.within @ alike.reshape(-1, k * k)
             taken = taken.reshape(b, n_bases, n_bases, k, k).transpose(0, 3, 1, 4, 2)
@@ -351,7 +381,7 @@ def _information(
     scaled = information * unit[:, :, None] * unit[:, None, :]
     whitener = _whitener(scaled)
     seen = np.diagonal(scaled, axis1=1, axis2=2).max(axis=1)
-    of_epoch = gathered(np.einsum("nkk->n", square), place.epoch)  # E w
+    of_epoch = gathered(tangents.sizes(place.cells), place.epoch)  # E w
     carried = np.einsum("ebw,ew->be", part.by_epoch**2, of_epoch, optimize=True)
     carried = carried.reshape(b, n_bases, -1).sum(axis=1)
     total = carried.sum(axis=1)
