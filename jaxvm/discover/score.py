@@ -168,7 +168,9 @@ class ScoreTests:
         cells, groups = self.arrangement.cells, iter(family.groups)
         n, height = residual.shape
         by_component = n, self.arrangement.components, -1
-        while some := tuple(islice(groups, _STACKED)):
+        # Of very many terms the products would take more room than the tangents.
+        wide = family.n_terms > height
+        while some := tuple(islice(groups, 1 if wide else _STACKED)):
             terms = [(group, term) for group in some for term in group.terms]
             ends = np.cumsum([len(group.terms) for group in some])
             own = [
@@ -180,8 +182,6 @@ class ScoreTests:
             ]
             product = np.empty((n, len(terms)))
             halves = np.empty((n, len(terms), cells.half.shape[2])) if full else None
-            # Of very many terms the products would take more room than the tangents.
-            wide = family.n_terms > height
             square = [] if wide else [np.empty((n, *2 * (family.n_terms,))) for _ in some]
             stack = np.empty((n if wide else _CELLS, len(terms), *own[0][0].shape[1:]))
             for first in range(0, n, _CELLS):
@@ -199,7 +199,7 @@ class ScoreTests:
             for g, end in enumerate(ends):
                 at = slice(end - family.n_terms, end)
                 half = None if halves is None else halves[:, at]
-                own_stack = stack[:, at].reshape(n, family.n_terms, height) if wide else None
+                own_stack = stack.reshape(n, family.n_terms, height) if wide else None
                 products = None if wide else square[g]
                 yield _Tangents(cells.n_local, products, own_stack, half, product[:, at])
 
