@@ -45,7 +45,8 @@ def asked(folder: Path, entries: list[dict]) -> list[dict]:
             rivals = {ids[name] for name in best["rivals"]} - {before[0]}
             if best["decides"] and rivals:
                 told = {"plan": best["plan"], "chance": min(best["chances"])}
-                cases.append({"entry": entry, "before": before, "rivals": sorted(rivals)} | told)
+                told |= {"before": before, "rivals": sorted(rivals), "claims": claims(finding)}
+                cases.append({"entry": entry} | told)
                 break
     return cases
 
@@ -82,27 +83,25 @@ def follow(folder: Path, case: dict) -> dict:
 
 
 def outcome(case: dict, report: dict, facts: Facts) -> dict:
-    """Whether the right name comes first after both recordings, and what is left beside it."""
-    entry = case["entry"]
-    right = [
-        finding
-        for finding in report["findings"]
-        if any(same_name(t, claims(finding)[0]["rows"], facts) for t in entry["hidden"])
-    ]
-    # A name that is no other physics for the key (an exact tie) is not left over.
-    alone = [
-        all(
-            any(same_name(t, c["rows"] or catalogue_rows(c["catalogue_id"]), facts)
-                for t in entry["hidden"])
-            for c in claims(finding)
-        )
-        for finding in right
-    ]  # fmt: skip
+    """Whether the right name comes first after both recordings, and what is left beside it.
+
+    Of several hidden effects those count that the finding may have been: another one that comes out
+    right says nothing of this advice.
+    """
+
+    def right(claim: dict, truths: list[dict]) -> bool:
+        rows = claim["rows"] or catalogue_rows(claim["catalogue_id"])
+        return any(same_name(truth, rows, facts) for truth in truths)
+
+    meant = [t for t in case["entry"]["hidden"] if any(right(c, [t]) for c in case["claims"])]
+    found = [f for f in report["findings"] if right(claims(f)[0], meant)]
     pairs = [{case["before"][0], rival} for rival in case["rivals"]]
-    parted = [not any(pair <= set(_names(finding)) for pair in pairs) for finding in right]
+    # A name that is no other physics for the key (an exact tie) is not left over.
+    alone = [all(right(claim, meant) for claim in claims(f)) for f in found]
+    parted = [not any(pair <= set(_names(f)) for pair in pairs) for f in found]
     return {
         "after": [_names(finding) for finding in report["findings"]],
-        "right": bool(right),
+        "meant": [truth["effect"] for truth in meant],
         "apart": any(a or p for a, p in zip(alone, parted, strict=True)),
         "alone": any(alone),
     }
@@ -121,10 +120,10 @@ def main() -> None:
     results = []
     with ThreadPoolExecutor(options.jobs) as pool:
         for case in pool.map(lambda c: follow(folder, c), cases):
-            entry = case.pop("entry")
+            entry, _ = case.pop("entry"), case.pop("claims")
             case |= {"id": entry["id"], "hidden": [t["effect"] for t in entry["hidden"]]}
             results.append(case)
-            state = case.get("failed") or ("apart" if case["apart"] else case["after"])
+            state = "apart" if case.get("apart") else case.get("after", case.get("failed"))
             words = f"{case['id']}  {case['hidden']}  {case['before']}  {case['plan']}"
             print(f"{words}  ({case['chance']:.0%}): {state}", flush=True)
     apart, alone = (sum(case.get(key, False) for case in results) for key in ("apart", "alone"))
