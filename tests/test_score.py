@@ -10,8 +10,9 @@ from test_steps import dense
 
 from jaxvm.discover.battery import Part, Place
 from jaxvm.discover.noise import multipliers
+from jaxvm.discover.products import Tangents, whitener_of
 from jaxvm.discover.ranking import surprise
-from jaxvm.discover.score import ScoreTests, _Tangents, _whitener
+from jaxvm.discover.score import ScoreTests
 from jaxvm.discover.space import enumerate_hypotheses, member
 from jaxvm.network.residual import residual
 from jaxvm.physics.drivers import OWN_BODY
@@ -125,7 +126,7 @@ def test_rounding_of_what_is_absorbed_stops_nothing():
     rng = np.random.default_rng(0)
     axes = np.linalg.qr(rng.normal(size=(4, 4)))[0]
     sound, broken = ((axes * [1.0, 0.3, 0.1, last]) @ axes.T for last in (0.05, -3e-8))
-    found = _whitener(np.stack([sound, broken]))
+    found = whitener_of(np.stack([sound, broken]))
     assert np.allclose(found[0].T @ found[0], np.linalg.inv(sound), rtol=1e-6)
     inverse = (axes[:, :3] / [1.0, 0.3, 0.1]) @ axes[:, :3].T
     assert np.allclose(found[1].T @ found[1], inverse, rtol=1e-6, atol=1e-9)
@@ -141,8 +142,8 @@ def test_products_of_many_terms_are_those_of_few(n_bases):
     place = Place(cells, np.zeros((0, 1), int), np.zeros((0, 1), int))
     part = Part(0, np.arange(2), place, rng.normal(size=(2, n_bases, len(cells))))
     product = np.zeros((100, terms))
-    few = _Tangents(0, square, None, None, product)
-    many = _Tangents(0, None, stack, None, product)
+    few = Tangents(0, square, None, None, product)
+    many = Tangents(0, None, stack, None, product)
     np.testing.assert_allclose(many.gram(part), few.gram(part), atol=1e-10)
     np.testing.assert_allclose(many.sizes(cells), few.sizes(cells), rtol=1e-12)
     # Term by term: column (k, i) is the tangent of term k times base i.

@@ -33,6 +33,7 @@ PROMISED = 0.95
 """Chance of coming apart from which on a plan is said to decide."""
 
 _SURE = 0.99
+"""Chance from which on plans are as good as each other, and the cheaper one comes first."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +129,7 @@ def _batches(scene: Scene, rivals: Sequence[Hypothesis]) -> list[tuple[Scene, li
     One that has no room alone is left out: it would need programs of its own.
     """
     present = scene.fitted_effects()
-    new = [rival.effect(np.zeros(rival.effect(()).n_columns)) for rival in rivals]
+    new = [rival.effect(np.zeros(rival.n_columns)) for rival in rivals]
 
     def together(numbers: list[int]):
         return (*present, *(new[k] for k in numbers))

@@ -117,6 +117,11 @@ class Hypothesis:
     entries: tuple[Entry, ...]
     alternatives: dict[str, int] = field(default_factory=dict, compare=False)
 
+    @property
+    def n_columns(self) -> int:
+        """Number of amplitudes: terms times bases."""
+        return len(self.group.terms) * len(FORMS[self.course.form].bases)
+
     def same(self, other: "Hypothesis") -> bool:
         """Whether both say the same of the observations, whatever their names."""
         mine = self.group.terms, self.course.driver, self.course.form, self.scope

@@ -13,7 +13,6 @@ from jaxvm.discover.diagnosis import Finding
 from jaxvm.discover.hypotheses import Hypothesis
 from jaxvm.discover.select import price, price_of_columns
 from jaxvm.network.scene import Scene
-from jaxvm.physics.forms import FORMS
 from jaxvm.solve.adjust import Adjustment
 from jaxvm.solve.covariance import wald_drops
 
@@ -69,8 +68,7 @@ def _better(
     """
     scene, given = current.scene, len(current.scene.effects) - len(findings)
     effects = list(scene.fitted_effects())
-    columns = len(other.group.terms) * len(FORMS[other.course.form].bases)
-    effects[given + k] = other.effect(np.zeros(columns))
+    effects[given + k] = other.effect(np.zeros(other.n_columns))
     tried = fit(scene.with_effects(tuple(effects), scene.room))
     if not tried.converged:
         return current, findings, k

@@ -24,11 +24,20 @@ from dataclasses import dataclass, field
 from itertools import islice
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
-from jaxvm.discover.battery import MOST_PRODUCTS, Battery, Part, battery
-from jaxvm.discover.cells import Arrangement, Cells, arrange, gathered
+from jaxvm.discover.battery import Battery, Part, battery
+from jaxvm.discover.cells import Arrangement, Cells, arrange
 from jaxvm.discover.hypotheses import Family
+from jaxvm.discover.products import (
+    CELLS,
+    Information,
+    Tangents,
+    at_cells,
+    by_terms,
+    drop_of,
+    information_of,
+)
 from jaxvm.discover.ranking import Ranking, Scores, surprise
 from jaxvm.network.scene import Scene
 from jaxvm.physics.drivers import OBSERVATION_DRIVERS, driven_by, patterns
@@ -36,17 +45,8 @@ from jaxvm.physics.effects import Term
 from jaxvm.physics.ports import PORT_INDEX
 from jaxvm.solve.adjust import Adjustment
 
-_ABSORBED = 1e-8
-"""Relative information below which a direction counts as absorbed by the model."""
-
 _STACKED = 16
 """Groups whose tangents are multiplied at a time."""
-
-_CELLS = 64
-"""Cells of which they are."""
-
-FEWEST_EPOCHS = 3.0
-"""A hypothesis that fewer epochs carry than this can't be told from a few bad images."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class ScoreTests:
     scene: Scene
     arrangement: Arrangement
     battery: Battery
-    _known: dict[tuple[int, int, int], "_Information"] = field(default_factory=dict)
+    _known: dict[tuple[int, int, int], Information] = field(default_factory=dict)
     _patterns: dict[tuple, np.ndarray] = field(default_factory=dict)
 
     @classmethod
@@ -145,10 +145,10 @@ class ScoreTests:
                 key = number, g, p
                 shared = tangents.shared(part) if tested.flips or key not in self._known else None
                 if shared is not None and key not in self._known:
-                    self._known[key] = _information(tangents, part, shared, family.valid[here])
+                    self._known[key] = information_of(tangents, part, shared, family.valid[here])
                 known = self._known[key]
                 seen[here], sound[here] = known.seen, known.sound
-                drop[here], amplitude[here] = _drop(known, part, product)
+                drop[here], amplitude[here] = drop_of(known, part, product)
                 freedom[here] = amplitude.shape[-1]
                 if shared is not None and tested.flips and known.sound.any():
                     found = _flipped(known, part, product, shared, tested)
@@ -160,7 +160,7 @@ class ScoreTests:
         found = drop, z, amplitude, seen, inflation, freedom, null, sound
         return Scores(family, *found, tested.variance)
 
-    def _tangents(self, family: Family, residual: np.ndarray, full: bool) -> Iterator["_Tangents"]:
+    def _tangents(self, family: Family, residual: np.ndarray, full: bool) -> Iterator[Tangents]:
         """Products of the tangents of each group, some groups and some cells at a time.
 
         What is multiplied stays in the cache, and what all groups share is read once for some.
@@ -183,10 +183,10 @@ class ScoreTests:
             product = np.empty((n, len(terms)))
             halves = np.empty((n, len(terms), cells.half.shape[2])) if full else None
             square = [] if wide else [np.empty((n, *2 * (family.n_terms,))) for _ in some]
-            stack = np.empty((n if wide else _CELLS, len(terms), *own[0][0].shape[1:]))
-            for first in range(0, n, _CELLS):
-                here = slice(first, min(first + _CELLS, n))
-                apart = stack[here] if wide else stack[: min(_CELLS, n - first)]
+            stack = np.empty((n if wide else CELLS, len(terms), *own[0][0].shape[1:]))
+            for first in range(0, n, CELLS):
+                here = slice(first, min(first + CELLS, n))
+                apart = stack[here] if wide else stack[: min(CELLS, n - first)]
                 for k, (tangent, pattern) in enumerate(own):
                     np.multiply(tangent[here], pattern[here], out=apart[:, k])
                 piece = apart.reshape(*apart.shape[:2], height)
@@ -201,7 +201,7 @@ class ScoreTests:
                 half = None if halves is None else halves[:, at]
                 own_stack = stack.reshape(n, family.n_terms, height) if wide else None
                 products = None if wide else square[g]
-                yield _Tangents(cells.n_local, products, own_stack, half, product[:, at])
+                yield Tangents(cells.n_local, products, own_stack, half, product[:, at])
 
     def _pattern(self, term, mark: tuple[int, int] | None) -> Float[np.ndarray, "cells width"]:
         """Pattern of a term over the observations of all cells, of one mark or of all."""
@@ -265,179 +265,21 @@ class _Tested:
         return 1 if self.signs is None else self.signs.shape[1]
 
 
-@dataclass(frozen=True)
-class _Tangents:
-    """Products of the tangents of one group, before its courses, in each cell.
-
-    Attributes:
-        n_local: columns of `halves` that belong to local unknowns.
-        square: among themselves; None where they are so many that
-        stack: the tangents themselves take less room.
-        halves: with J L^-T; None where they are not wanted.
-        product: with the residuals.
-    """
-
-    n_local: int
-    square: Float[np.ndarray, "cells terms terms"] | None
-    stack: Float[np.ndarray, "cells terms rows"] | None
-    halves: Float[np.ndarray, "cells terms halves"] | None
-    product: Float[np.ndarray, "cells terms"]
-
-    def shared(self, part: Part) -> Float[np.ndarray, "b columns shared"]:
-        """What the shared unknowns see of each course."""
-        assert self.halves is not None
-        return _summed(part, _at(self.halves[:, :, self.n_local :], part.place.cells))
-
-    def gram(self, part: Part) -> Float[np.ndarray, "b columns columns"]:
-        """Products of each course's columns, term by term."""
-        weights, cells = part.weights, part.place.cells
-        b, n_bases, n = weights.shape
-        k = self.product.shape[1]
-        if self.square is None:
-            assert self.stack is not None
-            gram = np.zeros((b, k * n_bases, k * n_bases))
-            for first in range(0, n, _CELLS):
-                here = slice(first, first + _CELLS)
-                piece = np.swapaxes(self.stack[cells[here]], 0, 1)  # k n rows
-                for own, course in zip(gram, weights[:, :, here], strict=True):
-                    columns = (piece[:, None] * course[:, :, None]).reshape(k * n_bases, -1)
-                    own += columns @ columns.T
-            return gram
-        square = _at(self.square, cells)
-        if n_bases == 1:
-            return ((weights[:, 0] ** 2) @ square.reshape(n, k * k)).reshape(b, k, k)
-        gram = np.empty((b, k, n_bases, k, n_bases))
-        for i in range(k):
-            for j in range(i + 1):
-                both = (weights * square[:, i, j]) @ np.swapaxes(weights, 1, 2)
-                gram[:, i, :, j] = gram[:, j, :, i] = both
-        return gram.reshape(b, k * n_bases, k * n_bases)
-
-    def sizes(self, cells: np.ndarray) -> Float[np.ndarray, " n"]:
-        """Sum of squares of all tangents in each cell."""
-        if self.square is None:
-            assert self.stack is not None
-            return np.einsum("nkr,nkr->n", self.stack, self.stack)[cells]
-        return np.einsum("nkk->n", self.square)[cells]
-
-
 def _key(term: Term) -> tuple:
     """What the pattern of a term depends on."""
     return term.driver, term.basis, term.constants
 
 
-def _at(values: np.ndarray, cells: np.ndarray) -> np.ndarray:
-    """Values of some cells, in ascending order; of all of them without a copy."""
-    return values if len(cells) == len(values) else values[cells]
-
-
-def _summed(part: Part, values: Float[np.ndarray, "n terms ..."]) -> np.ndarray:
-    """Sums over the cells of a part, weighted by its courses: [b, columns, ...], term by term."""
-    b, n_bases, n = part.weights.shape
-    sums = part.weights.reshape(b * n_bases, n) @ values.reshape(n, -1)
-    return _by_terms(sums.reshape(b * n_bases, *values.shape[1:]), part)
-
-
-def _by_terms(values: Float[np.ndarray, "b_bases terms ..."], part: Part) -> np.ndarray:
-    """One axis of columns, term by term."""
-    b, n_bases, _ = part.weights.shape
-    split = values.reshape(b, n_bases, *values.shape[1:])
-    return np.swapaxes(split, 1, 2).reshape(b, -1, *values.shape[2:])
-
-
-def _information(
-    tangents: _Tangents, part: Part, shared: np.ndarray, valid: np.ndarray
-) -> "_Information":
-    """Information of each course, whitened.
-
-    Few large matrix products, in NumPy: a compiled program for every shape of a family would take
-    longer to make than to run.
-    """
-    place, d = part.place, tangents.n_local
-    b, n_bases, _ = part.weights.shape
-    k = tangents.product.shape[1]
-    columns = k * n_bases
-    gram = tangents.gram(part)
-    information = gram - shared @ np.swapaxes(shared, 1, 2)
-    if d:
-        assert tangents.halves is not None
-        own = _at(tangents.halves[:, :, :d], place.cells)
-        padded = np.concatenate([own, np.zeros((1, k, d))])[place.group]
-        few = place.group.size * place.group.shape[1] * k**2 <= MOST_PRODUCTS
-        if few and part.within is not None:
-            alike = np.einsum("gvkd,gwld->gvwkl", padded, padded, optimize=True)
-            taken = part.within @ alike.reshape(-1, k * k)
-            taken = taken.reshape(b, n_bases, n_bases, k, k).transpose(0, 3, 1, 4, 2)
-            information -= taken.reshape(b, columns, columns)
-        else:
-            local = part.by_group @ padded.reshape(*place.group.shape, k * d)  # G (b i) (k d)
-            local = np.moveaxis(local, 0, 1).reshape(b * n_bases, -1, k, d)
-            local = _by_terms(np.swapaxes(local, 1, 2), part).reshape(b, columns, -1)
-            information -= local @ np.swapaxes(local, 1, 2)
-
-    # Directions that the model absorbs to eight digits carry no information.
-    size = np.diagonal(gram, axis1=1, axis2=2)
-    unit = 1.0 / np.sqrt(np.where(size > 0.0, size, 1.0))
-    scaled = information * unit[:, :, None] * unit[:, None, :]
-    whitener = _whitener(scaled)
-    seen = np.diagonal(scaled, axis1=1, axis2=2).max(axis=1)
-    of_epoch = gathered(tangents.sizes(place.cells), place.epoch)  # E w
-    carried = np.einsum("ebw,ew->be", part.by_epoch**2, of_epoch, optimize=True)
-    carried = carried.reshape(b, n_bases, -1).sum(axis=1)
-    total = carried.sum(axis=1)
-    n_carrying = total**2 / np.maximum(np.sum(carried**2, axis=1), 1e-300)
-    fewest = min(FEWEST_EPOCHS, 0.5 * len(place.epoch))
-    sound = valid & (seen > 1e-6) & (total > 0.0) & (n_carrying >= fewest)
-    return _Information(whitener * unit[:, None, :], seen, sound)
-
-
-def _whitener(information: Float[np.ndarray, "b k k"]) -> Float[np.ndarray, "b k k"]:
-    """W with W^T W the inverse of what information is left, and nearly nothing along the rest.
-
-    What the model absorbs leaves rounding behind, whose eigenvalues may be negative where the model
-    itself is badly conditioned.
-    """
-    try:
-        root = np.linalg.cholesky(information + _ABSORBED * np.eye(information.shape[-1]))
-        return np.linalg.inv(root)
-    except np.linalg.LinAlgError:
-        values, vectors = np.linalg.eigh(information)
-        size = np.sqrt(np.where(values > _ABSORBED, values + _ABSORBED, np.inf))
-        return np.swapaxes(vectors / size[:, None, :], 1, 2)
-
-
-@dataclass(frozen=True)
-class _Information:
-    """What the courses of a part can show, whatever the residuals.
-
-    Attributes:
-        whitener: W with W^T W the inverse information, so that the drop is |W S|^2.
-        seen: share of the effect that the model does not absorb.
-        sound: hypotheses that the model does not absorb and that enough epochs carry.
-    """
-
-    whitener: Float[np.ndarray, "b columns columns"]
-    seen: Float[np.ndarray, " b"]
-    sound: Bool[np.ndarray, " b"]
-
-
-def _drop(known: _Information, part: Part, product: np.ndarray):
-    """Drop of chi-square [b] and one-step amplitudes [b, columns]."""
-    score = _summed(part, _at(product, part.place.cells))
-    score = np.einsum("bdc,bc->bd", known.whitener, score)
-    return np.sum(score**2, axis=1), -np.einsum("bdc,bd->bc", known.whitener, score)
-
-
 def _flipped(
-    known: _Information, part: Part, product: np.ndarray, shared: np.ndarray, tested: _Tested
+    known: Information, part: Part, product: np.ndarray, shared: np.ndarray, tested: _Tested
 ):
     """Inflation and freedom of each course [b], and the largest z of each repetition."""
     place, sound = part.place, known.sound
     b, columns, _ = shared.shape
-    padded = np.concatenate([_at(product, place.cells), np.zeros((1, product.shape[1]))])[
+    padded = np.concatenate([at_cells(product, place.cells), np.zeros((1, product.shape[1]))])[
         place.epoch
     ]
-    scores = _by_terms(np.moveaxis(part.by_epoch @ padded, 0, 2), part)  # b c E
+    scores = by_terms(np.moveaxis(part.by_epoch @ padded, 0, 2), part)  # b c E
     scores = known.whitener[sound] @ (scores[sound] - shared[sound] @ tested.pull.T)
     # A fitted residual lacks what the shared unknowns take of its epoch, about 1/epochs.
     lost = max(1.0 - 1.0 / tested.n_fitted, 0.5)

@@ -164,7 +164,7 @@ class Search:
         current, variance = self.current, robust_variance(self.current)
         residual = self.parts.residuals(current)
         wave, p, drop = strongest_wave(current.scene, residual, self.seed)
-        columns = np.zeros(len(wave.group.terms) * len(FORMS[wave.course.form].bases))
+        columns = np.zeros(wave.n_columns)
         leading = [(wave, drop / variance, columns)]
         alike = likeness(current.scene, residual)
         # Where neighbours are only a little alike, it may be noise that they share.

@@ -1,0 +1,180 @@
+"""Products of the tangents of one group of hypotheses, and the information of its courses.
+
+With G the tangents, J the Jacobian of the model and H = L L^T its normal matrix, G^T M G is
+G^T G - Y^T Y with Y = (J L^-T)^T G: all are sums over cells, weighted by a course.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxvm.discover.battery import MOST_PRODUCTS, Part
+from jaxvm.discover.cells import gathered
+
+_ABSORBED = 1e-8
+"""Relative information below which a direction counts as absorbed by the model."""
+
+_FEWEST_EPOCHS = 3.0
+"""A hypothesis that fewer epochs carry than this can't be told from a few bad images."""
+
+CELLS = 64
+"""Cells whose tangents are multiplied at a time."""
+
+
+@dataclass(frozen=True)
+class Tangents:
+    """Products of the tangents of one group, before its courses, in each cell.
+
+    Attributes:
+        n_local: columns of `halves` that belong to local unknowns.
+        square: among themselves; None where they are so many that
+        stack: the tangents themselves take less room.
+        halves: with J L^-T; None where they are not wanted.
+        product: with the residuals.
+    """
+
+    n_local: int
+    square: Float[np.ndarray, "cells terms terms"] | None
+    stack: Float[np.ndarray, "cells terms rows"] | None
+    halves: Float[np.ndarray, "cells terms halves"] | None
+    product: Float[np.ndarray, "cells terms"]
+
+    def shared(self, part: Part) -> Float[np.ndarray, "b columns shared"]:
+        """What the shared unknowns see of each course."""
+        assert self.halves is not None
+        return _summed(part, at_cells(self.halves[:, :, self.n_local :], part.place.cells))
+
+    def gram(self, part: Part) -> Float[np.ndarray, "b columns columns"]:
+        """Products of each course's columns, term by term."""
+        weights, cells = part.weights, part.place.cells
+        b, n_bases, n = weights.shape
+        k = self.product.shape[1]
+        if self.square is None:
+            assert self.stack is not None
+            gram = np.zeros((b, k * n_bases, k * n_bases))
+            for first in range(0, n, CELLS):
+                here = slice(first, first + CELLS)
+                piece = np.swapaxes(self.stack[cells[here]], 0, 1)  # k n rows
+                for own, course in zip(gram, weights[:, :, here], strict=True):
+                    columns = (piece[:, None] * course[:, :, None]).reshape(k * n_bases, -1)
+                    own += columns @ columns.T
+            return gram
+        square = at_cells(self.square, cells)
+        if n_bases == 1:
+            return ((weights[:, 0] ** 2) @ square.reshape(n, k * k)).reshape(b, k, k)
+        gram = np.empty((b, k, n_bases, k, n_bases))
+        for i in range(k):
+            for j in range(i + 1):
+                both = (weights * square[:, i, j]) @ np.swapaxes(weights, 1, 2)
+                gram[:, i, :, j] = gram[:, j, :, i] = both
+        return gram.reshape(b, k * n_bases, k * n_bases)
+
+    def sizes(self, cells: np.ndarray) -> Float[np.ndarray, " n"]:
+        """Sum of squares of all tangents in each cell."""
+        if self.square is None:
+            assert self.stack is not None
+            return np.einsum("nkr,nkr->n", self.stack, self.stack)[cells]
+        return np.einsum("nkk->n", self.square)[cells]
+
+
+def at_cells(values: np.ndarray, cells: np.ndarray) -> np.ndarray:
+    """Values of some cells, in ascending order; of all of them without a copy."""
+    return values if len(cells) == len(values) else values[cells]
+
+
+def _summed(part: Part, values: Float[np.ndarray, "n terms ..."]) -> np.ndarray:
+    """Sums over the cells of a part, weighted by its courses: [b, columns, ...], term by term."""
+    b, n_bases, n = part.weights.shape
+    sums = part.weights.reshape(b * n_bases, n) @ values.reshape(n, -1)
+    return by_terms(sums.reshape(b * n_bases, *values.shape[1:]), part)
+
+
+def by_terms(values: Float[np.ndarray, "b_bases terms ..."], part: Part) -> np.ndarray:
+    """One axis of columns, term by term."""
+    b, n_bases, _ = part.weights.shape
+    split = values.reshape(b, n_bases, *values.shape[1:])
+    return np.swapaxes(split, 1, 2).reshape(b, -1, *values.shape[2:])
+
+
+def information_of(
+    tangents: Tangents, part: Part, shared: np.ndarray, valid: np.ndarray
+) -> "Information":
+    """Information of each course, whitened.
+
+    Few large matrix products, in NumPy: a compiled program for every shape of a family would take
+    longer to make than to run.
+    """
+    place, d = part.place, tangents.n_local
+    b, n_bases, _ = part.weights.shape
+    k = tangents.product.shape[1]
+    columns = k * n_bases
+    gram = tangents.gram(part)
+    information = gram - shared @ np.swapaxes(shared, 1, 2)
+    if d:
+        assert tangents.halves is not None
+        own = at_cells(tangents.halves[:, :, :d], place.cells)
+        padded = np.concatenate([own, np.zeros((1, k, d))])[place.group]
+        few = place.group.size * place.group.shape[1] * k**2 <= MOST_PRODUCTS
+        if few and part.within is not None:
+            alike = np.einsum("gvkd,gwld->gvwkl", padded, padded, optimize=True)
+            taken = part.within @ alike.reshape(-1, k * k)
+            taken = taken.reshape(b, n_bases, n_bases, k, k).transpose(0, 3, 1, 4, 2)
+            information -= taken.reshape(b, columns, columns)
+        else:
+            local = part.by_group @ padded.reshape(*place.group.shape, k * d)  # G (b i) (k d)
+            local = np.moveaxis(local, 0, 1).reshape(b * n_bases, -1, k, d)
+            local = by_terms(np.swapaxes(local, 1, 2), part).reshape(b, columns, -1)
+            information -= local @ np.swapaxes(local, 1, 2)
+
+    # Directions that the model absorbs to eight digits carry no information.
+    size = np.diagonal(gram, axis1=1, axis2=2)
+    unit = 1.0 / np.sqrt(np.where(size > 0.0, size, 1.0))
+    scaled = information * unit[:, :, None] * unit[:, None, :]
+    whitener = whitener_of(scaled)
+    seen = np.diagonal(scaled, axis1=1, axis2=2).max(axis=1)
+    of_epoch = gathered(tangents.sizes(place.cells), place.epoch)  # E w
+    carried = np.einsum("ebw,ew->be", part.by_epoch**2, of_epoch, optimize=True)
+    carried = carried.reshape(b, n_bases, -1).sum(axis=1)
+    total = carried.sum(axis=1)
+    n_carrying = total**2 / np.maximum(np.sum(carried**2, axis=1), 1e-300)
+    fewest = min(_FEWEST_EPOCHS, 0.5 * len(place.epoch))
+    sound = valid & (seen > 1e-6) & (total > 0.0) & (n_carrying >= fewest)
+    return Information(whitener * unit[:, None, :], seen, sound)
+
+
+def whitener_of(information: Float[np.ndarray, "b k k"]) -> Float[np.ndarray, "b k k"]:
+    """W with W^T W the inverse of what information is left, and nearly nothing along the rest.
+
+    What the model absorbs leaves rounding behind, whose eigenvalues may be negative where the model
+    itself is badly conditioned.
+    """
+    try:
+        root = np.linalg.cholesky(information + _ABSORBED * np.eye(information.shape[-1]))
+        return np.linalg.inv(root)
+    except np.linalg.LinAlgError:
+        values, vectors = np.linalg.eigh(information)
+        size = np.sqrt(np.where(values > _ABSORBED, values + _ABSORBED, np.inf))
+        return np.swapaxes(vectors / size[:, None, :], 1, 2)
+
+
+@dataclass(frozen=True)
+class Information:
+    """What the courses of a part can show, whatever the residuals.
+
+    Attributes:
+        whitener: W with W^T W the inverse information, so that the drop is |W S|^2.
+        seen: share of the effect that the model does not absorb.
+        sound: hypotheses that the model does not absorb and that enough epochs carry.
+    """
+
+    whitener: Float[np.ndarray, "b columns columns"]
+    seen: Float[np.ndarray, " b"]
+    sound: Bool[np.ndarray, " b"]
+
+
+def drop_of(known: Information, part: Part, product: np.ndarray):
+    """Drop of chi-square [b] and one-step amplitudes [b, columns]."""
+    score = _summed(part, at_cells(product, part.place.cells))
+    score = np.einsum("bdc,bc->bd", known.whitener, score)
+    return np.sum(score**2, axis=1), -np.einsum("bdc,bd->bc", known.whitener, score)
