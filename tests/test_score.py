@@ -8,6 +8,7 @@ import pytest
 from networks import dense_residuals, stereo_recording
 from test_steps import dense
 
+from jaxvm.discover import products
 from jaxvm.discover.battery import Part, Place
 from jaxvm.discover.noise import multipliers
 from jaxvm.discover.products import Tangents, whitener_of
@@ -17,7 +18,7 @@ from jaxvm.discover.space import enumerate_hypotheses, member
 from jaxvm.network.residual import residual
 from jaxvm.physics.drivers import OWN_BODY
 from jaxvm.physics.effects import Effect, Scope, Term
-from jaxvm.physics.ports import PORTS
+from jaxvm.physics.ports import PORT_INDEX, PORTS
 from jaxvm.recording.recording import Drivers
 from jaxvm.solve.adjust import adjust
 from jaxvm.solve.problem import scene_problem
@@ -86,6 +87,44 @@ def test_drops_are_those_of_dense_projections(stereo, ranked):
             assert scores.drop[g, c, s] == pytest.approx(expected, rel=1e-3, abs=1e-4), hypothesis
             compared.add(hypothesis.course.driver)
     assert {"constant", "time", "ambient_degC", OWN_BODY} <= compared
+
+
+def test_maps_are_scored_as_by_dense_matrices(stereo, monkeypatch):
+    """Few terms and many, with products within groups and without, against M G itself."""
+    families = [f for f in enumerate_hypotheses(stereo.scene) if f.n_terms > 8]
+    tests = ScoreTests.of(stereo, tuple(families))
+    scored = tests.score(1.0).scores
+    monkeypatch.setattr(products, "MOST_PRODUCTS", 0)
+    again = ScoreTests.of(stereo, tuple(families)).score(1.0).scores
+    cells, wide = tests.arrangement.cells, set()
+    rows = cells.residual.size
+    for family, parts, one, other in zip(families, tests.battery.parts, scored, again, strict=True):
+        np.testing.assert_allclose(one.drop, other.drop, rtol=1e-6, atol=1e-6)
+        for part in parts:
+            if family.n_bases > 1 or not family.valid[0, part.courses[0], part.scope]:
+                continue
+            course = np.zeros(len(cells.residual))
+            course[part.place.cells] = part.weights[0, 0]
+            g = np.stack(
+                [
+                    cells.tangent[PORT_INDEX[term.port]]
+                    * np.tile(tests._pattern(term, None), tests.arrangement.components)
+                    * course[:, None]
+                    for term in family.groups[0].terms
+                ]
+            )
+            mg = np.stack([cells.projected(own) for own in g]).reshape(-1, rows)
+            score = mg @ cells.residual.ravel()
+            size = np.linalg.norm(g.reshape(-1, rows), axis=1)
+            size = np.where(size > 0.0, size, 1.0)
+            information = (mg @ mg.T) / np.outer(size, size)
+            # What is absorbed is cut off softly.
+            softened = information + 1e-8 * np.eye(len(size))
+            expected = float((score / size) @ np.linalg.solve(softened, score / size))
+            got = one.drop[0, part.courses[0], part.scope]
+            assert got == pytest.approx(expected, rel=1e-4), family.groups[0]
+            wide.add(family.n_terms > cells.residual.shape[1])
+    assert wide == {True, False}
 
 
 def test_own_temperatures_are_those_of_the_cameras(stereo):
