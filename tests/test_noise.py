@@ -1,44 +1,15 @@
 """The memory of noise against AR(1) series, and random multipliers against their covariance."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from networks import board_recording
+from long_series import N_EPOCHS, autoregressive, long_board, of_marks
 
 from jaxvm.discover.noise import LONGEST, REMEMBERED, memory, multipliers
-from jaxvm.network.scene import build
-from jaxvm.recording import Observations
-
-N_EPOCHS = 200
 
 
 @pytest.fixture(scope="module")
 def scene():
-    """A board of 30 marks in 200 epochs, 5 % of them lost; only who saw what matters here."""
-    recording = board_recording().recording
-    seen = np.flatnonzero(np.random.default_rng(0).random(N_EPOCHS * 30) > 0.05)
-    epoch, point = np.divmod(seen, 30)
-    nothing, n = np.zeros(len(seen), int), len(seen)
-    observations = Observations(epoch, nothing, nothing, point, np.zeros((n, 2)), np.ones(n))
-    number = np.arange(N_EPOCHS)
-    return build(replace(recording, epoch_ids=number, time=1.0 * number, observations=observations))
-
-
-def autoregressive(rng, phi: float, shape: tuple[int, ...]) -> np.ndarray:
-    """Stationary AR(1) series of unit variance along the first axis."""
-    white = rng.standard_normal(shape)
-    course = np.empty(shape)
-    course[0] = white[0]
-    for k in range(1, len(course)):
-        course[k] = phi * course[k - 1] + np.sqrt(1.0 - phi**2) * white[k]
-    return course
-
-
-def of_marks(scene, courses: np.ndarray) -> np.ndarray:
-    """Residuals of the observations: each mark [epochs, marks, 2] has its own course."""
-    obs = scene.recording.observations
-    return courses[obs.epoch, obs.point]
+    return long_board()
 
 
 def test_white_residuals_do_not_remember(scene):

@@ -11,11 +11,13 @@ from dataclasses import replace
 import numpy as np
 
 from jaxvm.discover.advice import advise
+from jaxvm.discover.correlation import Correlation, met
 from jaxvm.discover.diagnosis import Diagnosis, Finding, Quality
 from jaxvm.discover.gross import without_gross_errors
 from jaxvm.discover.heldout import (
     HeldOut,
     Split,
+    fitted_residuals,
     hold_out,
     split,
 )
@@ -80,7 +82,7 @@ def diagnose(
     final = _with_best_instants(final, parts.sound)
     excess = 2.0 * plain.cost - current.variance_factor * plain.degrees_of_freedom
     findings = [replace(f, share=float(f.drop / max(excess, 1e-9))) for f in findings]
-    findings = _with_final_values(final, findings, len(effects))
+    findings = _with_final_values(final, findings, len(effects), parts.sound)
     findings = [
         replace(f, sharing=sharing(current, len(effects) + k, parts))
         for k, f in enumerate(findings)
@@ -128,7 +130,7 @@ def _with_advice(final: Adjustment, finding: Finding, place: int, parts: Split) 
         parts.sound,
         place,
         [r.hypothesis for r in others],
-        final.variance_factor * finding.noise[0],
+        final.variance_factor * finding.noise,
         log_odds=[
             2.0 * float(np.log(max(finding.weight, 1e-9) / rival.weight)) for rival in others
         ],
@@ -172,24 +174,29 @@ def _with_best_instants(final: Adjustment, weights) -> Adjustment:
     return final
 
 
-def _with_final_values(final: Adjustment, findings: list[Finding], given: int) -> list[Finding]:
+def _with_final_values(
+    final: Adjustment, findings: list[Finding], given: int, sound: tuple[np.ndarray, ...]
+) -> list[Finding]:
     """Findings with the values of the fit to all epochs.
 
-    Noise with a memory widens them. An instant that no fit refines keeps the spread of those that
-    did nearly as well.
+    Noise that is correlated widens them. An instant that no fit refines keeps the spread of those
+    that did nearly as well.
     """
-    values = zip(final.scene.fitted_effects(), effect_deviations(final), strict=True)
-    pairs = zip(findings, list(values)[given:], strict=True)
+    noise = Correlation.of(final.scene, fitted_residuals(final, sound))
+    values = zip(
+        final.scene.fitted_effects(), effect_deviations(final), met(final, noise), strict=True
+    )
     return [
         replace(
             f,
             final_effect=effect,
             final_stds=tuple(
-                float(np.sqrt(f.noise[0])) * own or first
-                for own, first in zip(stds, f.stds or stds, strict=True)
+                float(np.sqrt(ratio)) * own or first
+                for own, ratio, first in zip(stds, noise.ratio, f.stds or stds, strict=True)
             ),
+            noise=noise.inflation,
         )
-        for f, (effect, stds) in pairs
+        for f, (effect, stds, noise) in zip(findings, list(values)[given:], strict=True)
     ]
 
 

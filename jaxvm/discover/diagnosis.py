@@ -29,8 +29,7 @@ class Finding:
         rivals: hypotheses that this recording can't tell from it.
         p_value: family-wise, under noise that remembers as long as the residuals do.
         p_independent: the same for noise that is independent from epoch to epoch.
-        noise: its drop under noise that remembers as long as the residuals do is about the first of
-            these numbers times a chi-square with the second as its degrees of freedom.
+        noise: by how much more correlated noise makes chi-square drop than white noise does.
         n_hypotheses: how many were tried.
         drop: of chi-square in the fitted epochs, by the stated sigmas.
         share: of the plain model's excess chi-square that it explains.
@@ -67,7 +66,7 @@ class Finding:
     chosen: int
     sharing: Sharing | None = None
     advice: tuple[Advice, ...] = ()
-    noise: tuple[float, float] = (1.0, 1.0)
+    noise: float = 1.0
 
 
 @dataclass(frozen=True)

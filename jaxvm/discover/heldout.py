@@ -105,14 +105,7 @@ class Split:
 
     def residuals(self, fitted: Adjustment) -> np.ndarray:
         """Whitened residuals [observations, 2] of the fitted epochs; NaN where not fitted."""
-        scene = fitted.scene
-        found = np.full((len(scene.recording.observations.epoch), 2), np.nan)
-        blocks = fitted.residuals().pixels
-        for rows, weight, block in zip(scene.tables, self.weights, blocks, strict=True):
-            own = np.asarray(block).copy()
-            own[weight == 0] = np.nan
-            found[rows] = own
-        return found
+        return fitted_residuals(fitted, self.weights)
 
 
 def split(scene: Scene, held: np.ndarray, sound: tuple[np.ndarray, ...]) -> Split:
@@ -140,6 +133,18 @@ def range_weights_of(scene: Scene, epochs: np.ndarray) -> np.ndarray | None:
     """Weights of the ranges: 1 in the chosen epochs."""
     ranges = scene.recording.ranges
     return None if ranges is None else epochs[ranges.epoch].astype(float)
+
+
+def fitted_residuals(fitted: Adjustment, weights: tuple[np.ndarray, ...]) -> np.ndarray:
+    """Whitened residuals [observations, 2], rows as in the recording; NaN where not fitted."""
+    scene = fitted.scene
+    found = np.full((len(scene.recording.observations.epoch), 2), np.nan)
+    blocks = fitted.residuals().pixels
+    for rows, weight, block in zip(scene.tables, weights, blocks, strict=True):
+        own = np.asarray(block).copy()
+        own[weight == 0] = np.nan
+        found[rows] = own
+    return found
 
 
 def evaluate(scene: Scene, held: np.ndarray, sound: tuple[np.ndarray, ...]) -> HeldOut:

@@ -157,20 +157,6 @@ def spread_of_constant(ranking: Ranking, hypothesis: Hypothesis, scene: Scene) -
     return 0.0
 
 
-def noise_of(ranking: Ranking, hypothesis: Hypothesis, scene: Scene) -> tuple[float, float] | None:
-    """Inflation and freedom of a hypothesis under the multipliers, at its most inflated course.
-
-    None where it was not scored: the model has it already.
-    """
-    met = [
-        (float(scores.inflation[g, k, s]), float(scores.freedom[g, k, s]))
-        for scores, g, own, s in _where(ranking, hypothesis, scene)
-        for k in own
-        if scores.valid[g, k, s]
-    ]
-    return max(met, default=None)
-
-
 def _where(ranking: Ranking, hypothesis: Hypothesis, scene: Scene):
     """Scores, group, courses and scope of a hypothesis, whatever its constants."""
     kind = hypothesis.course.driver, hypothesis.course.form

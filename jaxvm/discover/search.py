@@ -6,13 +6,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from jaxvm.discover.accept import Accepted, accept, short
+from jaxvm.discover.correlation import Correlation, Met, met
 from jaxvm.discover.detail import with_detail
 from jaxvm.discover.diagnosis import Finding
 from jaxvm.discover.heldout import HeldOut, Split, gain
 from jaxvm.discover.hypotheses import FREE, Hypothesis
 from jaxvm.discover.noise import LONGEST, memory, multipliers
 from jaxvm.discover.pairs import better_pair, other_beginnings, worth_a_second_thought
-from jaxvm.discover.ranking import Ranking, noise_of, spread_of_constant, surprise
+from jaxvm.discover.ranking import Ranking, spread_of_constant, surprise
 from jaxvm.discover.revise import lost_without, prune, rename, with_effects
 from jaxvm.discover.rivals import rivals
 from jaxvm.discover.scatter import ALIKE, likeness, of_each_image
@@ -302,10 +303,10 @@ class Search:
         Noise with a memory looks like a smooth effect, and so does an effect that is not found yet:
         that is why earlier findings are looked at again after each new one.
         """
-        scene = self.current.scene
+        scene, residual = self.current.scene, self.parts.residuals(self.current)
         # Without a clock neighbours in the list are alike for other reasons (the board's attitude).
         timed = scene.recording.timed
-        window = memory(scene, self.parts.residuals(self.current)) if timed else 1
+        window = memory(scene, residual) if timed else 1
         if window == 1:
             return [replace(f, p_value=f.p_independent) for f in self.findings]
         n_epochs = len(scene.recording.time)
@@ -313,15 +314,13 @@ class Search:
         remembering = multipliers(n_epochs, window, FLIPS, self.seed)
         variance = robust_variance(self.current)
         left = self._tests.score(variance, remembering, stacked(self.current), studentised=True)
+        noise = met(self.current, Correlation.of(scene, residual))[self.given :]
 
-        def again(finding: Finding) -> Finding:
-            met = noise_of(left, finding.hypothesis, scene) or (1.0, 1.0)
-            inflation, freedom = max(met, finding.noise)
-            z = float(surprise(np.array(finding.drop / variance / inflation), freedom))
-            p = max(left.p_value(z), finding.p_independent)
-            return replace(finding, p_value=p, noise=(inflation, freedom))
+        def again(finding: Finding, own: Met) -> Finding:
+            z = float(surprise(np.array(finding.drop / variance / own.inflation), own.freedom))
+            return replace(finding, p_value=max(left.p_value(z), finding.p_independent))
 
-        return [again(finding) for finding in self.findings]
+        return [again(finding, own) for finding, own in zip(self.findings, noise, strict=True)]
 
     def _settle(self) -> None:
         """Drop what noise with a memory explains, and give the findings their last names."""

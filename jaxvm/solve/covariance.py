@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxvm.network.residual import Residuals
 from jaxvm.network.state import State
 from jaxvm.solve.adjust import Adjustment
 from jaxvm.solve.arrow import ArrowFactors, factorise
@@ -97,6 +98,32 @@ def amplitude_covariance(
     factor = np.asarray(problem.factor)[positions]
     spread = factor[:, None] * inverse * factor
     return spread if chosen is None else spread[np.ix_(chosen, chosen)]
+
+
+def influence(adjustment: Adjustment, positions: np.ndarray) -> Residuals:
+    """Weights with which whitened residuals enter the estimates at positions of the flat state.
+
+    The columns of J H^-1, in the units of the parameters: an estimate errs by minus the sum of its
+    weights times the whitened noise. White noise of unit variance gives it the sum of their squares
+    as its variance; what noise of another covariance gives it is found in the same way. Blocks of
+    residuals get a last axis, one entry for each position; zero where a parameter is held.
+    """
+    problem = adjustment.problem
+    columns = np.asarray(problem.column)[positions]
+    units = np.zeros((problem.n, len(columns)))
+    live = np.flatnonzero(columns < problem.n)
+    units[columns[live], live] = np.asarray(problem.factor)[positions[live]]
+    steps = jnp.asarray(_solve(_factors(adjustment), jnp.asarray(units)))
+    weights = _along(problem, adjustment.x, steps)
+    tables = zip(weights.pixels, adjustment.scene.tables, strict=True)
+    return weights._replace(pixels=tuple(block[: len(rows)] for block, rows in tables))
+
+
+@eqx.filter_jit
+def _along(problem: Problem, x, steps: Float[Array, "n k"]) -> Residuals:
+    """Change of all residuals along each of some steps."""
+    _, change = jax.linearize(problem.residual, x)
+    return jax.vmap(change, in_axes=1, out_axes=-1)(steps)
 
 
 def pose_covariances(

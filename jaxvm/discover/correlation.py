@@ -1,0 +1,229 @@
+"""Correlation of noise: what marks remember, what the marks of an image share, and what it costs.
+
+Noise is white, plus a first-order Gauss-Markov process of every mark, plus one that the marks of an
+image share: in time series of positions a usual model (Williams 2003, J. Geodesy 76, 483-494).
+Shares and memories are those that explain the mean products of residuals at all distances in time,
+by the expectation of such products where every series lost its own mean. In a short recording that
+takes away much of the noise at low frequencies, which is where most effects are.
+
+An estimate that weights whitened noise by v has the variance v^T R v, not v^T v. Unlike an average
+over the recording's own few slow swings, the correlation R of very many marks is well known.
+"""
+
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxvm.network.scene import Scene
+from jaxvm.solve.adjust import Adjustment
+from jaxvm.solve.covariance import influence
+
+LONGEST = 0.3
+"""Longest distance in time that is looked at, as a share of the recording."""
+
+_SHOWN = 9.2
+"""Chi-square with which a process must show: that of 1 % for two unknowns."""
+
+_BY_EPOCH = (0.0, *np.exp(-1.0 / np.geomspace(0.3, 50.0, 24)))
+"""Correlations of neighbouring epochs that are tried."""
+
+
+@dataclass(frozen=True)
+class Correlation:
+    """Correlation R of whitened noise of unit variance; all else of it is white.
+
+    Attributes:
+        mark, image: shares of the variance that a mark remembers, and that all marks of an image
+            share.
+        of_mark, of_image: their correlations from epoch to epoch.
+    """
+
+    mark: float = 0.0
+    of_mark: float = 0.0
+    image: float = 0.0
+    of_image: float = 0.0
+
+    @classmethod
+    def of(cls, scene: Scene, residual: Float[np.ndarray, "observations 2"]) -> "Correlation":
+        """The correlation that residuals show; white noise where they show none or have no clock.
+
+        Args:
+            scene: the fitted scene.
+            residual: whitened residuals in the order of the recording, NaN where not fitted.
+        """
+        obs = scene.recording.observations
+        used = np.isfinite(residual).all(axis=1)
+        n_epochs = len(scene.recording.time)
+        n_lags = int(LONGEST * n_epochs)
+        if not scene.recording.timed or n_lags < 3 or used.sum() < 50:
+            return cls()
+        mark, image = _labels(scene)
+        seen = _by_epoch(mark[used], obs.epoch[used], np.ones((used.sum(), 1)), n_epochs)
+        each = _by_epoch(mark[used], obs.epoch[used], residual[used], n_epochs)
+        each -= seen * each.sum(1, keepdims=True) / np.maximum(seen.sum(1, keepdims=True), 1.0)
+        own, pairs = _products(each, n_lags), 2.0 * _products(seen, n_lags)
+        if not own[0] > 0.0:
+            return cls()
+        # Of different marks: of all marks of an image, without those of a mark with itself.
+        camera = np.zeros(len(each), int)
+        camera[mark] = image
+        shared = _products(_summed(each, camera), n_lags) - own
+        shared_pairs = 2.0 * _products(_summed(seen, camera), n_lags) - pairs
+        variance = own[0] / pairs[0]
+        expected = _expected(seen.any(axis=(0, 2)), n_lags)
+        # At no distance in time a pair of different marks is counted twice.
+        sure = shared_pairs / np.where(np.arange(n_lags) > 0, 1.0, 2.0)
+        share, k = _process(_mean(shared, shared_pairs) / variance, sure, expected, white=False)
+        left = _mean(own, pairs) / variance - share * expected[k]
+        of_mark, m = _process(left, pairs, expected, white=True)
+        share = min(share, 1.0)
+        return cls(min(of_mark, 1.0 - share), _BY_EPOCH[m], share, _BY_EPOCH[k])
+
+    def between(
+        self, scene: Scene, weights: Float[np.ndarray, "observations 2 k"]
+    ) -> Float[np.ndarray, "k k"]:
+        """Covariance W^T R W of estimates that weight whitened noise by the columns of W."""
+        flat = weights.reshape(-1, weights.shape[2])
+        found = (1.0 - self.mark - self.image) * (flat.T @ flat)
+        epoch, n_epochs = scene.recording.observations.epoch, len(scene.recording.time)
+        mark, image = _labels(scene)
+        for share, by_epoch, label in (
+            (self.mark, self.of_mark, mark),
+            (self.image, self.of_image, image),
+        ):
+            if share > 0.0:
+                found += share * _remembered(_by_epoch(label, epoch, weights, n_epochs), by_epoch)
+        return found
+
+
+@dataclass(frozen=True)
+class Met:
+    """What correlated noise does to the estimates of one effect.
+
+    Attributes:
+        ratio: of the variances of its amplitudes, then of its constants, to those in white noise.
+        inflation, freedom: its drop of chi-square under noise alone is about `inflation` times a
+            chi-square with so many degrees of freedom (Satterthwaite 1946).
+    """
+
+    ratio: Float[np.ndarray, " parameters"]
+    inflation: float
+    freedom: float
+
+
+def met(fitted: Adjustment, noise: Correlation) -> list[Met]:
+    """What noise of this correlation does to each effect of a fitted scene."""
+    scene, layout = fitted.scene, fitted.problem.network.layout
+    amplitude, constant = layout.all("amplitude"), layout.all("constant")
+    places = [
+        np.concatenate([amplitude[columns], constant[constants]])
+        for columns, constants in scene.places()
+    ]
+    sizes = [columns.stop - columns.start for columns, _ in scene.places()]
+    if not noise.mark + noise.image > 0.0:
+        return [Met(np.ones(len(own)), 1.0, n) for own, n in zip(places, sizes, strict=True)]
+    found = influence(fitted, np.concatenate(places))
+    n_observations = len(scene.recording.observations.epoch)
+    pixels = np.zeros((n_observations, *found.pixels[0].shape[1:]))
+    for rows, block in zip(scene.tables, found.pixels, strict=True):
+        pixels[rows] = block
+    white = sum(
+        np.einsum("rci,rcj->ij", block, block, optimize=True)
+        for block in (np.asarray(one) for one in jax.tree.leaves(found))
+    )
+    flat = pixels.reshape(-1, pixels.shape[2])
+    correlated = white - flat.T @ flat + noise.between(scene, pixels)
+    ends = np.cumsum([len(own) for own in places])
+    return [
+        _met(white[own, own], correlated[own, own], n)
+        for own, n in zip(map(slice, ends - [len(p) for p in places], ends), sizes, strict=True)
+    ]
+
+
+def _met(white: np.ndarray, correlated: np.ndarray, n: int) -> Met:
+    """From the covariances of amplitudes, of which there are n, and constants."""
+    usual = np.diagonal(white)
+    ratio = np.where(usual > 0.0, np.diagonal(correlated) / np.where(usual > 0.0, usual, 1.0), 1.0)
+    # A drop of chi-square is a^T C^-1 a of the amplitudes, with the C of white noise.
+    relative = np.linalg.lstsq(white[:n, :n], correlated[:n, :n], rcond=1e-10)[0]
+    mean, spread = np.trace(relative), np.trace(relative @ relative)
+    return Met(ratio, float(spread / mean), float(mean**2 / spread))
+
+
+def _labels(scene: Scene) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
+    """Of every observation: a mark as seen by a camera, and the camera."""
+    obs = scene.recording.observations
+    mark = obs.camera * scene.first_point[-1] + scene.first_point[obs.target] + obs.point
+    return np.unique(mark, return_inverse=True)[1], obs.camera
+
+
+def _by_epoch(label, epoch, values, n_epochs: int) -> Float[np.ndarray, "labels epochs ..."]:
+    """Sums of values over the observations of a label and an epoch."""
+    found = np.zeros((int(label.max()) + 1, n_epochs, *values.shape[1:]))
+    np.add.at(found, (label, epoch), values)
+    return found
+
+
+def _summed(series, label) -> Float[np.ndarray, "labels epochs components"]:
+    found = np.zeros((int(label.max()) + 1, *series.shape[1:]))
+    np.add.at(found, label, series)
+    return found
+
+
+def _products(series, n_lags: int) -> Float[np.ndarray, " lags"]:
+    """Sums of the products of a series with itself, at all distances in time."""
+    n = series.shape[1]
+    return np.array([np.sum(series[:, d:] * series[:, : n - d]) for d in range(n_lags)])
+
+
+def _mean(total, count):
+    return total / np.maximum(count, 1.0)
+
+
+def _expected(fitted: np.ndarray, n_lags: int) -> Float[np.ndarray, "processes lags"]:
+    """Mean products of each process in `_BY_EPOCH`, of unit variance but without its own mean."""
+    n, distance = len(fitted), np.arange(len(fitted))
+    count = np.correlate(1.0 * fitted, 1.0 * fitted, "full")[n - 1 :][:n_lags]
+    found = []
+    for by_epoch in _BY_EPOCH:
+        kernel = by_epoch**distance
+        both = np.concatenate([kernel[:0:-1], kernel])
+        row = np.convolve(fitted, both)[n - 1 : 2 * n - 1]
+        row = np.where(fitted, row / fitted.sum(), 0.0)
+        rows = np.correlate(row, 1.0 * fitted, "full") + np.correlate(1.0 * fitted, row, "full")
+        lost = _mean(rows[n - 1 :][:n_lags], count)
+        found.append(kernel[:n_lags] - lost + row.sum() / fitted.sum())
+    return np.array(found)
+
+
+def _process(values, weight, expected, white: bool) -> tuple[float, int]:
+    """Share of the process that explains mean products best, and its place in `_BY_EPOCH`.
+
+    With `white` there is white noise beside it. Zero where it is no more than chance.
+    """
+    root = np.sqrt(weight)
+    values = values * root
+    basis = expected * root
+    best, found = _SHOWN, (0.0, 0)
+    beside = basis[0] / np.linalg.norm(basis[0]) if white else np.zeros_like(values)
+    values = values - beside * (beside @ values)
+    for k in range(1 if white else 0, len(basis)):
+        own = basis[k] - beside * (beside @ basis[k])
+        projection = float(own @ values)
+        drop = projection**2 / max(float(own @ own), 1e-300)
+        if projection > 0.0 and drop > best:
+            best, found = drop, (projection / float(own @ own), k)
+    return found
+
+
+def _remembered(courses, by_epoch: float) -> Float[np.ndarray, "k k"]:
+    """Sum over labels and components of W^T K W, with K the powers of `by_epoch`."""
+    first = np.moveaxis(courses, 1, 0)
+    filtered = first.copy()
+    for e in range(1, len(first)):
+        filtered[e] += by_epoch * filtered[e - 1]
+    flat, own = (a.reshape(-1, a.shape[-1]) for a in (filtered, first))
+    half = own.T @ flat
+    return half + half.T - own.T @ own

@@ -1,0 +1,164 @@
+"""Correlated noise against dense matrices, simulated series and refits."""
+
+from dataclasses import fields
+
+import jax
+import numpy as np
+import pytest
+from long_series import N_EPOCHS, autoregressive, long_board, of_marks
+from networks import stereo_recording
+from scipy.linalg import eigh
+
+from jaxvm.discover.correlation import _BY_EPOCH, Correlation, _expected, _remembered, met
+from jaxvm.network.residual import residual
+from jaxvm.physics.effects import Effect, Scope, Term
+from jaxvm.solve.adjust import adjust
+from jaxvm.solve.covariance import influence, standard_deviations
+
+APART = np.abs(np.subtract.outer(np.arange(N_EPOCHS), np.arange(N_EPOCHS)))
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return long_board()
+
+
+def noise_of(rng, mark, of_mark, image, of_image, marks=30):
+    """White noise, what marks remember and what the marks of an image share; [epochs, marks, 2]."""
+    white = rng.standard_normal((N_EPOCHS, marks, 2))
+    own = autoregressive(rng, of_mark, (N_EPOCHS, marks, 2))
+    common = autoregressive(rng, of_image, (N_EPOCHS, 1, 2))
+    return np.sqrt(1.0 - mark - image) * white + np.sqrt(mark) * own + np.sqrt(image) * common
+
+
+def test_products_are_those_of_a_series_without_its_mean():
+    fitted = np.random.default_rng(0).random(50) > 0.3
+    without_mean = np.diag(1.0 * fitted) - np.outer(fitted, fitted) / fitted.sum()
+    apart = APART[:50, :50]
+    for by_epoch, found in zip(_BY_EPOCH, _expected(fitted, 12), strict=True):
+        left = without_mean @ by_epoch**apart @ without_mean
+        pairs = np.outer(fitted, fitted)
+        dense = [np.diagonal(left, d).sum() / np.diagonal(pairs, d).sum() for d in range(12)]
+        np.testing.assert_allclose(found, dense, atol=1e-12)
+
+
+@pytest.mark.parametrize("by_epoch", [0.0, 0.3, 0.95])
+def test_what_is_remembered_is_a_quadratic_form(by_epoch):
+    courses = np.random.default_rng(1).standard_normal((3, N_EPOCHS, 2, 4))
+    dense = np.einsum("leck,ef,lfcm->km", courses, by_epoch**APART, courses, optimize=True)
+    np.testing.assert_allclose(_remembered(courses, by_epoch), dense, rtol=1e-9, atol=1e-6)
+
+
+def test_white_noise_is_white(scene):
+    n = len(scene.recording.observations.epoch)
+    found = [
+        Correlation.of(scene, np.random.default_rng(seed).standard_normal((n, 2)))
+        for seed in range(60)
+    ]
+    assert sum(c.mark == 0.0 and c.image == 0.0 for c in found) >= 56
+
+
+def test_shares_and_memories_are_recovered(scene):
+    found = []
+    for seed in range(20):
+        courses = noise_of(np.random.default_rng(seed), 0.3, 0.7, 0.05, 0.8)
+        # A constant offset of a mark is no noise.
+        courses += np.random.default_rng(seed).standard_normal((1, 30, 2))
+        c = Correlation.of(scene, of_marks(scene, courses))
+        found.append((c.mark, c.of_mark, c.image, c.of_image))
+    mean, std = np.mean(found, axis=0), np.std(found, axis=0)
+    # The grid of memories is as coarse as a tenth of what they are.
+    assert np.all(np.abs(mean - (0.3, 0.7, 0.05, 0.8)) < 4 * std / np.sqrt(20) + (0.02, 0.05) * 2)
+    assert np.all(std < (0.03, 0.05, 0.03, 0.2))
+
+
+def test_the_variance_of_an_estimate_is_the_dense_one(scene):
+    obs = scene.recording.observations
+    weights = np.random.default_rng(2).standard_normal((len(obs.epoch), 2, 3))
+    c = Correlation(0.4, 0.6, 0.1, 0.9)
+    apart = np.abs(np.subtract.outer(obs.epoch, obs.epoch))
+    same = obs.point[:, None] == obs.point
+    dense = 0.5 * np.eye(len(apart)) + 0.4 * same * 0.6**apart + 0.1 * 0.9**apart
+    expected = np.einsum("rck,rs,scm->km", weights, dense, weights, optimize=True)
+    np.testing.assert_allclose(c.between(scene, weights), expected, rtol=1e-9, atol=1e-6)
+
+
+def settling(noise: float):
+    """A stereo rig with ranges and an image that settles, with so much of the same noise."""
+    terms = (Term("detect.u"), Term("detect.v"))
+    effect = Effect(
+        "settles", terms, "time", "onset", (1.0,), 0.0, Scope(camera=("left",)), (2.0, -1.0)
+    )
+    scene = stereo_recording(noise=noise).true_scene()
+    return adjust(scene.with_effects((effect,), scene.room), rtol=1e-14)
+
+
+@pytest.fixture(scope="module")
+def bent():
+    return settling(1.0)
+
+
+def blocks_of(scene, residuals):
+    """Residuals without the padding of the tables, in one array [residuals, ...]."""
+    pixels = [np.asarray(b)[: len(r)] for b, r in zip(residuals.pixels, scene.tables, strict=True)]
+    blocks = [*pixels, *jax.tree.leaves(residuals[1:])]
+    return np.concatenate([np.reshape(b, (-1, *b.shape[2:])) for b in blocks])
+
+
+def weights_of(fitted):
+    """Influence of all residuals on every parameter of the state."""
+    return influence(fitted, np.arange(fitted.problem.network.layout.size))
+
+
+def flat(state) -> np.ndarray:
+    return np.concatenate([np.ravel(np.asarray(getattr(state, f.name))) for f in fields(state)])
+
+
+def test_weights_squared_are_the_variance_in_white_noise(bent):
+    weights = blocks_of(bent.scene, weights_of(bent))
+    deviations = flat(standard_deviations(bent))
+    # NaN where nothing is observed: room for more effects.
+    live = np.isfinite(deviations)
+    assert np.count_nonzero(deviations[live]) > 50
+    variance = np.sum(weights**2, axis=0)
+    np.testing.assert_allclose(np.sqrt(variance[live]), deviations[live], rtol=1e-6)
+
+
+def test_weights_foretell_what_a_little_more_noise_does(bent):
+    more = settling(1.001)
+    before = residual(bent.scene.state, bent.scene.network)
+    after = residual(bent.scene.state, more.scene.network)
+    change = blocks_of(bent.scene, after) - blocks_of(bent.scene, before)
+    moved = flat(more.scene.state) - flat(bent.scene.state)
+    foretold = -blocks_of(bent.scene, weights_of(bent)).T @ change
+    scale = flat(standard_deviations(bent))
+    live = np.isfinite(scale) & (scale > 0.0)
+    moved, foretold = (change[live] / scale[live] for change in (moved, foretold))
+    assert np.abs(foretold).max() > 1e-3
+    np.testing.assert_allclose(moved, foretold, atol=0.02 * np.abs(foretold).max())
+
+
+def test_what_noise_does_to_an_effect_is_dense(bent):
+    c, scene = Correlation(0.4, 0.6, 0.1, 0.9), bent.scene
+    obs, layout = scene.recording.observations, bent.problem.network.layout
+    own = np.concatenate([layout.all("amplitude")[:2], layout.all("constant")[:1]])
+    found = influence(bent, own)
+    pixels = np.zeros((len(obs.epoch), 2, 3))
+    for rows, block in zip(scene.tables, found.pixels, strict=True):
+        pixels[rows] = block
+    apart = np.abs(np.subtract.outer(obs.epoch, obs.epoch))
+    camera = obs.camera[:, None] == obs.camera
+    mark = camera & (obs.target[:, None] == obs.target) & (obs.point[:, None] == obs.point)
+    dense = 0.5 * np.eye(len(apart)) + 0.4 * mark * 0.6**apart + 0.1 * camera * 0.9**apart
+    weights, of_pixels = blocks_of(scene, found), np.einsum("rci,rcj->ij", pixels, pixels)
+    white = weights.T @ weights
+    correlated = np.einsum("rci,rs,scj->ij", pixels, dense, pixels, optimize=True)
+    # Ranges and priors are white.
+    correlated += white - of_pixels
+    (one,) = met(bent, c)
+    np.testing.assert_allclose(one.ratio, np.diagonal(correlated) / np.diagonal(white), rtol=1e-9)
+    eigenvalues = eigh(correlated[:2, :2], white[:2, :2], eigvals_only=True)
+    assert one.inflation * one.freedom == pytest.approx(eigenvalues.sum())
+    assert one.inflation == pytest.approx(np.sum(eigenvalues**2) / eigenvalues.sum())
+    (white_one,) = met(bent, Correlation())
+    assert (white_one.inflation, white_one.freedom) == (1.0, 2) and np.all(white_one.ratio == 1.0)
