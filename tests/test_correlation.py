@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 from long_series import N_EPOCHS, autoregressive, long_board, of_marks
-from networks import stereo_recording
+from networks import adjusted, stereo_recording
 from scipy.linalg import eigh
 
 from jaxvm.discover.correlation import _BY_EPOCH, Correlation, _expected, _remembered, met
@@ -162,3 +162,7 @@ def test_what_noise_does_to_an_effect_is_dense(bent):
     assert one.inflation == pytest.approx(np.sum(eigenvalues**2) / eigenvalues.sum())
     (white_one,) = met(bent, Correlation())
     assert (white_one.inflation, white_one.freedom) == (1.0, 2) and np.all(white_one.ratio == 1.0)
+
+
+def test_there_may_be_no_effect():
+    assert met(adjusted("board")[1], Correlation(0.3, 0.6)) == []

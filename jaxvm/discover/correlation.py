@@ -122,7 +122,7 @@ def met(fitted: Adjustment, noise: Correlation) -> list[Met]:
         for columns, constants in scene.places()
     ]
     sizes = [columns.stop - columns.start for columns, _ in scene.places()]
-    if not noise.mark + noise.image > 0.0:
+    if not places or not noise.mark + noise.image > 0.0:
         return [Met(np.ones(len(own)), 1.0, n) for own, n in zip(places, sizes, strict=True)]
     found = influence(fitted, np.concatenate(places))
     n_observations = len(scene.recording.observations.epoch)
