@@ -13,7 +13,6 @@ N_EPOCHS = 200
 
 def long_board() -> Scene:
     """5 % of the marks are lost; only who saw what matters here."""
-
     recording = board_recording().recording
     seen = np.flatnonzero(np.random.default_rng(0).random(N_EPOCHS * 30) > 0.05)
     epoch, point = np.divmod(seen, 30)

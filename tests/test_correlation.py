@@ -1,16 +1,18 @@
 """Correlated noise against dense matrices, simulated series and refits."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import jax
 import numpy as np
 import pytest
 from long_series import N_EPOCHS, autoregressive, long_board, of_marks
-from networks import adjusted, stereo_recording
+from networks import HELD, adjusted, at_values, board_recording, photographs, stereo_recording
 from scipy.linalg import eigh
 
+from jaxvm.discover.cells import local_rows
 from jaxvm.discover.correlation import _BY_EPOCH, Correlation, _expected, _remembered, met
 from jaxvm.network.residual import residual
+from jaxvm.network.scene import build
 from jaxvm.physics.effects import Effect, Scope, Term
 from jaxvm.solve.adjust import adjust
 from jaxvm.solve.covariance import influence, standard_deviations
@@ -23,12 +25,51 @@ def scene():
     return long_board()
 
 
-def noise_of(rng, mark, of_mark, image, of_image, marks=30):
-    """White noise, what marks remember and what the marks of an image share; [epochs, marks, 2]."""
-    white = rng.standard_normal((N_EPOCHS, marks, 2))
-    own = autoregressive(rng, of_mark, (N_EPOCHS, marks, 2))
-    common = autoregressive(rng, of_image, (N_EPOCHS, 1, 2))
-    return np.sqrt(1.0 - mark - image) * white + np.sqrt(mark) * own + np.sqrt(image) * common
+def board(free: frozenset[str], places: int):
+    """The board in 200 epochs, in so many places in turn, adjusted."""
+    known = board_recording(free=frozenset({"focal"}))
+    poses = known.truth["carrier_from_target"][:places]
+    motion = {"motion": "static", "pose": poses[0]} if places == 1 else {}
+    target = replace(known.recording.model.targets[0], free=free, **motion)
+    model = replace(known.recording.model, targets=(target,), priors=())
+    every = poses[np.arange(N_EPOCHS) % places]
+    rng, held = np.random.default_rng(0), [HELD] * N_EPOCHS
+    seen = photographs(model, N_EPOCHS, [held], [every], [target.points], rng, 1.0)
+    number = np.arange(N_EPOCHS)
+    recording = replace(
+        known.recording, model=model, epoch_ids=number, time=1.0 * number, observations=seen
+    )
+    scene = build(recording)
+    return adjust(at_values(scene, {"carrier_from_target": every} if places > 1 else {}))
+
+
+@pytest.fixture(scope="module")
+def still():
+    return board(frozenset(), 1)
+
+
+@pytest.fixture(scope="module")
+def moving():
+    """The pose of every epoch follows most of what its image does."""
+    return board(frozenset({"pose"}), 8)
+
+
+def shown(fitted, seed, mark=0.0, of_mark=0.0, image=0.0, of_image=0.0) -> Correlation:
+    """What is found in white noise, what marks remember and what the marks of an image share.
+
+    The unknowns of each epoch take their part of it.
+    """
+    rng = np.random.default_rng(seed)
+    courses = np.sqrt(1.0 - mark - image) * rng.standard_normal((N_EPOCHS, 30, 2))
+    courses += np.sqrt(mark) * autoregressive(rng, of_mark, (N_EPOCHS, 30, 2))
+    courses += np.sqrt(image) * autoregressive(rng, of_image, (N_EPOCHS, 1, 2))
+    noise = of_marks(fitted.scene, courses)
+    half, group = local_rows(fitted)
+    along = np.zeros((group.max() + 2, half.shape[2]))
+    np.add.at(along, group, np.einsum("ncd,nc->nd", half, noise))
+    left = noise - np.einsum("ncd,nd->nc", half, along[group])
+    # A constant offset of a mark is no noise.
+    return Correlation.of(fitted, left + of_marks(fitted.scene, np.full((N_EPOCHS, 30, 2), 3.0)))
 
 
 def test_products_are_those_of_a_series_without_its_mean():
@@ -49,27 +90,24 @@ def test_what_is_remembered_is_a_quadratic_form(by_epoch):
     np.testing.assert_allclose(_remembered(courses, by_epoch), dense, rtol=1e-9, atol=1e-6)
 
 
-def test_white_noise_is_white(scene):
-    n = len(scene.recording.observations.epoch)
-    found = [
-        Correlation.of(scene, np.random.default_rng(seed).standard_normal((n, 2)))
-        for seed in range(60)
-    ]
-    assert sum(c.mark == 0.0 and c.image == 0.0 for c in found) >= 56
+def test_white_noise_is_white(still, moving):
+    for fitted in (still, moving):
+        found = [shown(fitted, seed) for seed in range(40)]
+        # 1 % each for marks and images.
+        assert sum(c == Correlation(0.0, 0.0, 0.0, 0.0) for c in found) >= 36
 
 
-def test_shares_and_memories_are_recovered(scene):
-    found = []
-    for seed in range(20):
-        courses = noise_of(np.random.default_rng(seed), 0.3, 0.7, 0.05, 0.8)
-        # A constant offset of a mark is no noise.
-        courses += np.random.default_rng(seed).standard_normal((1, 30, 2))
-        c = Correlation.of(scene, of_marks(scene, courses))
-        found.append((c.mark, c.of_mark, c.image, c.of_image))
-    mean, std = np.mean(found, axis=0), np.std(found, axis=0)
-    # The grid of memories is as coarse as a tenth of what they are.
-    assert np.all(np.abs(mean - (0.3, 0.7, 0.05, 0.8)) < 4 * std / np.sqrt(20) + (0.02, 0.05) * 2)
-    assert np.all(std < (0.03, 0.05, 0.03, 0.2))
+def test_shares_and_memories_are_recovered(still, moving):
+    """Also where the pose of every epoch follows nearly all that its image does."""
+    truth = np.array([0.3, 0.7, 0.05, 0.8])
+    for fitted in (still, moving):
+        found = [shown(fitted, seed, *truth) for seed in range(20)]
+        found = np.array([(c.mark, c.of_mark, c.image, c.of_image) for c in found])
+        std = found.std(axis=0)
+        # Memories are a tenth apart, and the pose takes a tenth of what marks remember.
+        coarse = np.array([0.03, 0.03, 0.01, 0.05])
+        assert np.all(np.abs(found.mean(axis=0) - truth) < 4.0 * std / np.sqrt(20) + coarse)
+        assert np.all(std < (0.05, 0.06, 0.05, 0.2))
 
 
 def test_the_variance_of_an_estimate_is_the_dense_one(scene):

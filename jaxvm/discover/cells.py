@@ -121,10 +121,7 @@ def arrange(adjustment: Adjustment) -> Arrangement:
         assert isinstance(factor, PixelFactor | RangeFactor)
         n = factor.n_real
         starts.append(sum(len(k) for k in keys))
-        columns = np.asarray(packets.columns)[np.asarray(packet_of_rows(packets, len(r)))[:n]]
-        local = columns - problem.sizes[0]
-        inside = (local >= 0) & (columns < problem.n)
-        group = np.where(inside, local // max(problem.sizes[2], 1), -1).max(axis=1, initial=-1)
+        group = _group_of_rows(problem, packets, len(r))[:n]
         if isinstance(factor, PixelFactor):
             rows = scene.tables[number]
             entity = obs.camera[rows] * len(scene.model.targets) + obs.target[rows]
@@ -165,6 +162,32 @@ def arrange(adjustment: Adjustment) -> Arrangement:
         tuple(starts),
         components,
     )
+
+
+def local_rows(
+    adjustment: Adjustment,
+) -> tuple[Float[np.ndarray, "observations 2 local"], Int[np.ndarray, " observations"]]:
+    """Of every pixel observation the local part of its rows of J L^-T, and its local group.
+
+    Rows as in the recording; the group is -1 where an observation has none, and its rows are zero.
+    """
+    scene, problem = adjustment.scene, adjustment.problem
+    n, d = len(scene.recording.observations.epoch), problem.sizes[2]
+    halves, groups = np.zeros((n, 2, d)), np.full(n, -1)
+    tables = zip(scene.tables, problem.packets, _whitened(problem, adjustment.x), strict=False)
+    for rows, packets, (half, value, _) in tables:
+        groups[rows] = _group_of_rows(problem, packets, len(value))[: len(rows)]
+        halves[rows] = np.asarray(half)[: len(rows), :, :d]
+    halves[groups < 0] = 0.0
+    return halves, groups
+
+
+def _group_of_rows(problem: Problem, packets, n_rows: int) -> Int[np.ndarray, " rows"]:
+    """Local group of every observation of a table; -1 where it has none."""
+    columns = np.asarray(packets.columns)[np.asarray(packet_of_rows(packets, n_rows))]
+    local = columns - problem.sizes[0]
+    inside = (local >= 0) & (columns < problem.n)
+    return np.where(inside, local // max(problem.sizes[2], 1), -1).max(axis=1, initial=-1)
 
 
 def _by_component(

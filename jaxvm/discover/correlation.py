@@ -16,6 +16,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxvm.discover.cells import local_rows
 from jaxvm.network.scene import Scene
 from jaxvm.solve.adjust import Adjustment
 from jaxvm.solve.covariance import influence
@@ -25,6 +26,9 @@ LONGEST = 0.3
 
 _SHOWN = 9.2
 """Chi-square with which a process must show: that of 1 % for two unknowns."""
+
+_FELT = 1e-6
+"""Share of a shift of the image that must be left in residuals for them to tell anything."""
 
 _BY_EPOCH = (0.0, *np.exp(-1.0 / np.geomspace(0.3, 50.0, 24)))
 """Correlations of neighbouring epochs that are tried."""
@@ -46,40 +50,39 @@ class Correlation:
     of_image: float = 0.0
 
     @classmethod
-    def of(cls, scene: Scene, residual: Float[np.ndarray, "observations 2"]) -> "Correlation":
+    def of(cls, fitted: Adjustment, residual: Float[np.ndarray, "observations 2"]) -> "Correlation":
         """The correlation that residuals show; white noise where they show none or have no clock.
 
         Args:
-            scene: the fitted scene.
-            residual: whitened residuals in the order of the recording, NaN where not fitted.
+            fitted: the scene's adjustment.
+            residual: its whitened residuals in the order of the recording, NaN where not fitted.
         """
-        obs = scene.recording.observations
+        scene = fitted.scene
+        epoch, n_epochs = scene.recording.observations.epoch, len(scene.recording.time)
         used = np.isfinite(residual).all(axis=1)
-        n_epochs = len(scene.recording.time)
         n_lags = int(LONGEST * n_epochs)
         if not scene.recording.timed or n_lags < 3 or used.sum() < 50:
             return cls()
-        mark, image = _labels(scene)
-        seen = _by_epoch(mark[used], obs.epoch[used], np.ones((used.sum(), 1)), n_epochs)
-        each = _by_epoch(mark[used], obs.epoch[used], residual[used], n_epochs)
-        each -= seen * each.sum(1, keepdims=True) / np.maximum(seen.sum(1, keepdims=True), 1.0)
+        mark, _ = _labels(scene)
+        left = np.where(used[:, None], residual, 0.0)
+        seen = _by_epoch(mark, epoch, 1.0 * used[:, None], n_epochs)
+        each = _without_means(_by_epoch(mark, epoch, left, n_epochs), seen > 0.0)
         own, pairs = _products(each, n_lags), 2.0 * _products(seen, n_lags)
         if not own[0] > 0.0:
             return cls()
-        # Of different marks: of all marks of an image, without those of a mark with itself.
-        camera = np.zeros(len(each), int)
-        camera[mark] = image
-        shared = _products(_summed(each, camera), n_lags) - own
-        shared_pairs = 2.0 * _products(_summed(seen, camera), n_lags) - pairs
-        variance = own[0] / pairs[0]
-        expected = _expected(seen.any(axis=(0, 2)), n_lags)
-        # At no distance in time a pair of different marks is counted twice.
-        sure = shared_pairs / np.where(np.arange(n_lags) > 0, 1.0, 2.0)
-        share, k = _process(_mean(shared, shared_pairs) / variance, sure, expected, white=False)
-        left = _mean(own, pairs) / variance - share * expected[k]
-        of_mark, m = _process(left, pairs, expected, white=True)
-        share = min(share, 1.0)
-        return cls(min(of_mark, 1.0 - share), _BY_EPOCH[m], share, _BY_EPOCH[k])
+        own = own / np.maximum(pairs, 1.0) / (own[0] / pairs[0])
+        at = seen.any(axis=(0, 2))
+        expected = _expected(at, n_lags)
+        share, m = _process(own, pairs, expected, beside=expected[0])
+        of_marks = (1.0 - share) * expected[0] + share * expected[m]
+        shared, sure = _of_images(fitted, each[mark, epoch], used, at, of_marks)
+        common, k = _process(shared, sure, expected)
+        if share > 0.0 and not common > 0.0:
+            # What images share need not be shown where marks remember: likely they do, too.
+            (common, _), k = _process(shared, sure, expected[m : m + 1], shown=0.0), m
+        common = min(common, 1.0)
+        share, m = _process(own - common * expected[k], pairs, expected, beside=expected[0])
+        return cls(min(share, 1.0 - common), _BY_EPOCH[m], common, _BY_EPOCH[k])
 
     def between(
         self, scene: Scene, weights: Float[np.ndarray, "observations 2 k"]
@@ -166,20 +169,52 @@ def _by_epoch(label, epoch, values, n_epochs: int) -> Float[np.ndarray, "labels 
     return found
 
 
-def _summed(series, label) -> Float[np.ndarray, "labels epochs components"]:
-    found = np.zeros((int(label.max()) + 1, *series.shape[1:]))
-    np.add.at(found, label, series)
-    return found
+def _without_means(series, seen) -> Float[np.ndarray, "labels epochs components"]:
+    """Every series without its mean over the epochs where it is seen."""
+    count = np.maximum(seen.sum(1, keepdims=True), 1)
+    return series - seen * series.sum(1, keepdims=True) / count
+
+
+def _of_images(fitted: Adjustment, left, used, at, of_marks) -> tuple[np.ndarray, np.ndarray]:
+    """Mean products of what images share, of unit variance, and how sure each is; by distance.
+
+    Of an image that moves as a whole an epoch's own unknowns leave little, and what marks have for
+    themselves (`of_marks`, their mean products) moves it, too.
+    """
+    scene, n_lags = fitted.scene, len(of_marks)
+    epoch, n_epochs = scene.recording.observations.epoch, len(at)
+    shift = _shifts(fitted, used)
+    by_mark = _by_epoch(_labels(scene)[0], epoch, shift, n_epochs)
+    moved = np.zeros((1, n_epochs, shift.shape[2]))
+    np.add.at(moved[0], epoch, np.einsum("ncs,nc->ns", shift, left))
+    square = np.zeros((1, n_epochs, *2 * shift.shape[2:]))
+    np.add.at(square[0], epoch, np.einsum("ncs,nct->nst", shift, shift))
+    power = _products(square, n_lags)
+    if power[0] <= _FELT * used.sum():
+        return np.zeros(n_lags), np.zeros(n_lags)
+    found = _products(_without_means(moved, at[None, :, None]), n_lags) / fitted.variance_factor
+    found -= of_marks * _products(by_mark, n_lags)
+    # At no distance in time a product is a square, of twice the variance.
+    return found / np.maximum(power, 1e-300), power / np.where(np.arange(n_lags) > 0, 1.0, 2.0)
+
+
+def _shifts(fitted: Adjustment, used: np.ndarray) -> Float[np.ndarray, "observations 2 shifts"]:
+    """What is left of a shift of every camera's image, in u and in v, in whitened residuals."""
+    obs, scene = fitted.scene.recording.observations, fitted.scene
+    n_cameras = len(scene.model.cameras)
+    shift = np.zeros((len(obs.epoch), 2, n_cameras, 2))
+    shift[:, 0, :, 0] = shift[:, 1, :, 1] = obs.camera[:, None] == np.arange(n_cameras)
+    shift = used[:, None, None] * shift.reshape(len(obs.epoch), 2, -1)
+    half, group = local_rows(fitted)
+    along = np.zeros((int(group.max(initial=-1)) + 2, half.shape[2], shift.shape[2]))
+    np.add.at(along, group, np.einsum("ncd,ncs->nds", half, shift, optimize=True))
+    return shift - np.einsum("ncd,nds->ncs", half, along[group], optimize=True)
 
 
 def _products(series, n_lags: int) -> Float[np.ndarray, " lags"]:
     """Sums of the products of a series with itself, at all distances in time."""
     n = series.shape[1]
     return np.array([np.sum(series[:, d:] * series[:, : n - d]) for d in range(n_lags)])
-
-
-def _mean(total, count):
-    return total / np.maximum(count, 1.0)
 
 
 def _expected(fitted: np.ndarray, n_lags: int) -> Float[np.ndarray, "processes lags"]:
@@ -193,28 +228,32 @@ def _expected(fitted: np.ndarray, n_lags: int) -> Float[np.ndarray, "processes l
         row = np.convolve(fitted, both)[n - 1 : 2 * n - 1]
         row = np.where(fitted, row / fitted.sum(), 0.0)
         rows = np.correlate(row, 1.0 * fitted, "full") + np.correlate(1.0 * fitted, row, "full")
-        lost = _mean(rows[n - 1 :][:n_lags], count)
+        lost = rows[n - 1 :][:n_lags] / np.maximum(count, 1.0)
         found.append(kernel[:n_lags] - lost + row.sum() / fitted.sum())
     return np.array(found)
 
 
-def _process(values, weight, expected, white: bool) -> tuple[float, int]:
+def _process(values, weight, expected, beside=0.0, shown=_SHOWN) -> tuple[float, int]:
     """Share of the process that explains mean products best, and its place in `_BY_EPOCH`.
 
-    With `white` there is white noise beside it. Zero where it is no more than chance.
+    White noise, which has no memory, is left to what is `beside` it. Zero where it is no more than
+    chance.
     """
     root = np.sqrt(weight)
-    values = values * root
-    basis = expected * root
-    best, found = _SHOWN, (0.0, 0)
-    beside = basis[0] / np.linalg.norm(basis[0]) if white else np.zeros_like(values)
-    values = values - beside * (beside @ values)
-    for k in range(1 if white else 0, len(basis)):
-        own = basis[k] - beside * (beside @ basis[k])
-        projection = float(own @ values)
-        drop = projection**2 / max(float(own @ own), 1e-300)
-        if projection > 0.0 and drop > best:
-            best, found = drop, (projection / float(own @ own), k)
+    other = root * beside
+    other = other / max(float(np.linalg.norm(other)), 1e-300)
+    values = root * values
+    values = values - other * (other @ values)
+    best, found = shown, (0.0, 0)
+    for k, basis in enumerate(root * expected):
+        own = basis - other * (other @ basis)
+        square, projection = float(own @ own), float(own @ values)
+        if (
+            projection > 0.0
+            and square > 1e-9 * float(basis @ basis)
+            and projection**2 > best * square
+        ):
+            best, found = projection**2 / square, (projection / square, k)
     return found
 
 

@@ -182,7 +182,7 @@ def _with_final_values(
     Noise that is correlated widens them. An instant that no fit refines keeps the spread of those
     that did nearly as well.
     """
-    noise = Correlation.of(final.scene, fitted_residuals(final, sound))
+    noise = Correlation.of(final, fitted_residuals(final, sound))
     values = zip(
         final.scene.fitted_effects(), effect_deviations(final), met(final, noise), strict=True
     )

@@ -65,6 +65,7 @@ def rivals(
     tests: ScoreTests,
     n: int,
     shown: Iterable[tuple[Hypothesis, np.ndarray, float]] = (),
+    noise: float = 1.0,
 ) -> tuple[Rival, list[Rival]]:
     """The chosen hypothesis among its rivals, which are sorted by weight.
 
@@ -77,9 +78,10 @@ def rivals(
         tests: of all hypotheses, at the fit without it.
         n: number of pixel coordinates that are fitted.
         shown: hypotheses that the recording itself shows to be as good, with their amplitudes and
-            by how much their evidence is behind.
+            by how much their evidence is behind in white noise.
+        noise: by how much more than white noise it makes chi-square drop.
     """
-    variance = after.variance_factor
+    variance = noise * after.variance_factor
     change = stacked(before) - stacked(after)
     full = float(np.sum(change**2)) / variance
     # The gap that decides, and by how much smaller ones are shrunk.
@@ -112,7 +114,8 @@ def rivals(
             columns = price_of_columns(hypothesis, len(amplitudes), full - gap, n)
             cost = columns - own_columns + prices[_course_of(hypothesis)] - own_price
             weigh(hypothesis, amplitudes, gap, -0.5 * (shrunk * gap + cost))
-    for hypothesis, amplitudes, behind in shown:
+    for hypothesis, amplitudes, in_white in shown:
+        behind = in_white / noise
         if behind <= limit and not hypothesis.same(own):
             prior = log_prior(hypothesis, np.asarray(amplitudes)) - own_prior
             weigh(hypothesis, amplitudes, max(behind, 0.0), -0.5 * shrunk * behind - prior)

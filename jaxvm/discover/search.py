@@ -44,6 +44,9 @@ _TRIED_AGAIN, _HOPEFUL = 6, 0.75
 _WORSE = 1.01
 """Rise of the held-out RMS that other names may bring: what differs less is noise."""
 
+_WIDER = 1.2
+"""Inflation by noise from which the rivals of a finding are weighed again: more of them stay."""
+
 FLIPS = 199
 """Repetitions of the null distribution."""
 
@@ -304,23 +307,24 @@ class Search:
         that is why earlier findings are looked at again after each new one.
         """
         scene, residual = self.current.scene, self.parts.residuals(self.current)
+        noise = met(self.current, Correlation.of(self.current, residual))[self.given :]
+        found = [replace(f, noise=m.inflation) for f, m in zip(self.findings, noise, strict=True)]
         # Without a clock neighbours in the list are alike for other reasons (the board's attitude).
         timed = scene.recording.timed
         window = memory(scene, residual) if timed else 1
         if window == 1:
-            return [replace(f, p_value=f.p_independent) for f in self.findings]
+            return [replace(f, p_value=f.p_independent) for f in found]
         n_epochs = len(scene.recording.time)
         window = min(2 * window, max(int(LONGEST * n_epochs), 2))
         remembering = multipliers(n_epochs, window, FLIPS, self.seed)
         variance = robust_variance(self.current)
         left = self._tests.score(variance, remembering, stacked(self.current), studentised=True)
-        noise = met(self.current, Correlation.of(scene, residual))[self.given :]
 
         def again(finding: Finding, own: Met) -> Finding:
             z = float(surprise(np.array(finding.drop / variance / own.inflation), own.freedom))
             return replace(finding, p_value=max(left.p_value(z), finding.p_independent))
 
-        return [again(finding, own) for finding, own in zip(self.findings, noise, strict=True)]
+        return [again(finding, own) for finding, own in zip(found, noise, strict=True)]
 
     def _settle(self) -> None:
         """Drop what noise with a memory explains, and give the findings their last names."""
@@ -341,6 +345,8 @@ class Search:
                     self._weighed_again(k) if own else self.findings[k]
                     for k, own in enumerate(again)
                 ]
+        elif any(finding.noise > _WIDER for finding in self.findings):
+            self.findings = [self._weighed_again(0)]
         if [finding.hypothesis for finding in self.findings] != names:
             self.current, self.heldout = parts.proven(self.current)
             deviations = effect_deviations(self.current)[self.given :]
@@ -408,6 +414,7 @@ class Search:
             self._tests.at(without),
             parts.n,
             shown,
+            finding.noise,
         )
         return replace(finding, weight=chief.weight, drivers=chief.drivers, rivals=tuple(doubles))
 
