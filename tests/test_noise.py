@@ -1,10 +1,23 @@
-"""The memory of noise against AR(1) series, and random multipliers against their covariance."""
+"""Correlated noise against dense matrices, simulated series and refits."""
 
+from dataclasses import fields, replace
+
+import jax
 import numpy as np
 import pytest
 from long_series import N_EPOCHS, autoregressive, long_board, of_marks
+from networks import HELD, adjusted, at_values, board_recording, photographs, stereo_recording
+from scipy.linalg import eigh
 
-from jaxvm.discover.noise import LONGEST, REMEMBERED, memory, multipliers
+from jaxvm.discover.cells import local_rows
+from jaxvm.discover.noise import _BY_EPOCH, Correlation, _expected, _remembered, met
+from jaxvm.network.residual import residual
+from jaxvm.network.scene import build
+from jaxvm.physics.effects import Effect, Scope, Term
+from jaxvm.solve.adjust import adjust
+from jaxvm.solve.covariance import influence, standard_deviations
+
+APART = np.abs(np.subtract.outer(np.arange(N_EPOCHS), np.arange(N_EPOCHS)))
 
 
 @pytest.fixture(scope="module")
@@ -12,80 +25,182 @@ def scene():
     return long_board()
 
 
-def test_white_residuals_do_not_remember(scene):
-    n = len(scene.recording.observations.epoch)
-    found = [
-        memory(scene, np.random.default_rng(seed).standard_normal((n, 2))) for seed in range(30)
-    ]
-    # Three standard deviations, twice: one in several hundred is beyond by chance.
-    assert found.count(1) >= 29
+def board(free: frozenset[str], places: int):
+    """The board in 200 epochs, in so many places in turn, adjusted."""
+    known = board_recording(free=frozenset({"focal"}))
+    poses = known.truth["carrier_from_target"][:places]
+    motion = {"motion": "static", "pose": poses[0]} if places == 1 else {}
+    target = replace(known.recording.model.targets[0], free=free, **motion)
+    model = replace(known.recording.model, targets=(target,), priors=())
+    every = poses[np.arange(N_EPOCHS) % places]
+    rng, held = np.random.default_rng(0), [HELD] * N_EPOCHS
+    seen = photographs(model, N_EPOCHS, [held], [every], [target.points], rng, 1.0)
+    number = np.arange(N_EPOCHS)
+    recording = replace(
+        known.recording, model=model, epoch_ids=number, time=1.0 * number, observations=seen
+    )
+    scene = build(recording)
+    return adjust(at_values(scene, {"carrier_from_target": every} if places > 1 else {}))
 
 
-@pytest.mark.parametrize("phi", [0.3, 0.6])
-def test_memory_ends_where_the_correlation_does(scene, phi):
-    """But for two epochs: where it ends is where an estimate falls below a threshold."""
-    expected = int(np.ceil(np.log(REMEMBERED) / np.log(phi)))
-    for seed in range(5):
-        courses = autoregressive(np.random.default_rng(seed), phi, (N_EPOCHS, 30, 2))
-        assert abs(memory(scene, of_marks(scene, courses)) - expected) <= 2
+@pytest.fixture(scope="module")
+def still():
+    return board(frozenset(), 1)
 
 
-def test_memory_grows_with_the_correlation_up_to_a_share_of_the_recording(scene):
-    found = []
-    for phi in (0.0, 0.3, 0.6, 0.8, 0.95):
-        courses = autoregressive(np.random.default_rng(7), phi, (N_EPOCHS, 30, 2))
-        found.append(memory(scene, of_marks(scene, courses)))
-    assert found[0] == 1
-    assert found == sorted(found) and len(set(found[:4])) == 4
-    assert max(found) <= LONGEST * N_EPOCHS
+@pytest.fixture(scope="module")
+def moving():
+    """The pose of every epoch follows most of what its image does."""
+    return board(frozenset({"pose"}), 8)
 
 
-def test_what_a_whole_view_remembers_counts_too(scene):
-    """Each mark alone is white but for 4 % of its variance; the mean of the view tells."""
-    rng = np.random.default_rng(3)
-    white = rng.standard_normal((N_EPOCHS, 30, 2))
-    common = 0.2 * autoregressive(rng, 0.8, (N_EPOCHS, 1, 2))
-    assert memory(scene, of_marks(scene, white)) == 1
-    assert memory(scene, of_marks(scene, white + common)) > 1
+def shown(fitted, seed, mark=0.0, of_mark=0.0, image=0.0, of_image=0.0) -> Correlation:
+    """What is found in white noise, what marks remember and what the marks of an image share.
+
+    The unknowns of each epoch take their part of it.
+    """
+    rng = np.random.default_rng(seed)
+    courses = np.sqrt(1.0 - mark - image) * rng.standard_normal((N_EPOCHS, 30, 2))
+    courses += np.sqrt(mark) * autoregressive(rng, of_mark, (N_EPOCHS, 30, 2))
+    courses += np.sqrt(image) * autoregressive(rng, of_image, (N_EPOCHS, 1, 2))
+    noise = of_marks(fitted.scene, courses)
+    half, group = local_rows(fitted)
+    along = np.zeros((group.max() + 2, half.shape[2]))
+    np.add.at(along, group, np.einsum("ncd,nc->nd", half, noise))
+    left = noise - np.einsum("ncd,nd->nc", half, along[group])
+    # A constant offset of a mark is no noise.
+    return Correlation.of(fitted, left + of_marks(fitted.scene, np.full((N_EPOCHS, 30, 2), 3.0)))
 
 
-def test_a_constant_offset_of_a_mark_is_no_memory(scene):
-    rng = np.random.default_rng(4)
-    white = rng.standard_normal((N_EPOCHS, 30, 2))
-    assert memory(scene, of_marks(scene, white + 50.0 * rng.standard_normal((1, 30, 2)))) == 1
+def test_products_are_those_of_a_series_without_its_mean():
+    fitted = np.random.default_rng(0).random(50) > 0.3
+    without_mean = np.diag(1.0 * fitted) - np.outer(fitted, fitted) / fitted.sum()
+    apart = APART[:50, :50]
+    for by_epoch, found in zip(_BY_EPOCH, _expected(fitted, 12), strict=True):
+        left = without_mean @ by_epoch**apart @ without_mean
+        pairs = np.outer(fitted, fitted)
+        dense = [np.diagonal(left, d).sum() / np.diagonal(pairs, d).sum() for d in range(12)]
+        np.testing.assert_allclose(found, dense, atol=1e-12)
 
 
-def test_epochs_that_were_not_fitted_are_left_out(scene):
-    courses = autoregressive(np.random.default_rng(5), 0.6, (N_EPOCHS, 30, 2))
-    residual = of_marks(scene, courses)
-    held = scene.recording.observations.epoch % 3 == 2
-    residual[held] = np.nan
-    assert 4 <= memory(scene, residual) <= 8
-    assert memory(scene, np.full_like(residual, np.nan)) == 1
+@pytest.mark.parametrize("by_epoch", [0.0, 0.3, 0.95])
+def test_what_is_remembered_is_a_quadratic_form(by_epoch):
+    courses = np.random.default_rng(1).standard_normal((3, N_EPOCHS, 2, 4))
+    dense = np.einsum("leck,ef,lfcm->km", courses, by_epoch**APART, courses, optimize=True)
+    np.testing.assert_allclose(_remembered(courses, by_epoch), dense, rtol=1e-9, atol=1e-6)
 
 
-def test_independent_multipliers_are_signs():
-    for window in (0, 1):
-        signs = multipliers(12, window, 20_000, 0)
-        assert signs.shape == (12, 20_000)
-        assert set(np.unique(signs)) == {-1.0, 1.0}
-        assert np.abs(signs @ signs.T / 20_000 - np.eye(12)).max() < 5 / np.sqrt(20_000)
+def test_white_noise_is_white(still, moving):
+    for fitted in (still, moving):
+        found = [shown(fitted, seed) for seed in range(40)]
+        # 1 % each for marks and images.
+        assert sum(c == Correlation(0.0, 0.0, 0.0, 0.0) for c in found) >= 36
 
 
-@pytest.mark.parametrize("window", [2, 4, 9])
-def test_multipliers_have_a_triangular_covariance(window):
-    n, repetitions = 14, 40_000
-    values = multipliers(n, window, repetitions, 1)
-    assert values.shape == (n, repetitions)
-    apart = np.abs(np.arange(n)[:, None] - np.arange(n))
-    triangle = np.maximum(1.0 - apart / window, 0.0)
-    # A sampled covariance of Gaussians has the variance (1 + rho^2) / n.
-    assert np.abs(values.mean(axis=1)).max() < 5 / np.sqrt(repetitions)
-    assert np.abs(values @ values.T / repetitions - triangle).max() < 5 * np.sqrt(2 / repetitions)
+def test_shares_and_memories_are_recovered(still, moving):
+    """Also where the pose of every epoch follows nearly all that its image does."""
+    truth = np.array([0.3, 0.7, 0.05, 0.8])
+    for fitted in (still, moving):
+        found = [shown(fitted, seed, *truth) for seed in range(20)]
+        found = np.array([(c.mark, c.of_mark, c.image, c.of_image) for c in found])
+        std = found.std(axis=0)
+        # Memories are a tenth apart, and the pose takes a tenth of what marks remember.
+        coarse = np.array([0.03, 0.03, 0.01, 0.05])
+        assert np.all(np.abs(found.mean(axis=0) - truth) < 4.0 * std / np.sqrt(20) + coarse)
+        assert np.all(std < (0.05, 0.06, 0.05, 0.2))
 
 
-@pytest.mark.parametrize("window", [1, 5])
-def test_the_seed_gives_the_multipliers(window):
-    first, again, other = (multipliers(30, window, 8, seed) for seed in (3, 3, 4))
-    assert np.array_equal(first, again)
-    assert not np.array_equal(first, other)
+def test_the_variance_of_an_estimate_is_the_dense_one(scene):
+    obs = scene.recording.observations
+    weights = np.random.default_rng(2).standard_normal((len(obs.epoch), 2, 3))
+    c = Correlation(0.4, 0.6, 0.1, 0.9)
+    apart = np.abs(np.subtract.outer(obs.epoch, obs.epoch))
+    same = obs.point[:, None] == obs.point
+    dense = 0.5 * np.eye(len(apart)) + 0.4 * same * 0.6**apart + 0.1 * 0.9**apart
+    expected = np.einsum("rck,rs,scm->km", weights, dense, weights, optimize=True)
+    np.testing.assert_allclose(c.between(scene, weights), expected, rtol=1e-9, atol=1e-6)
+
+
+def settling(noise: float):
+    """A stereo rig with ranges and an image that settles, with so much of the same noise."""
+    terms = (Term("detect.u"), Term("detect.v"))
+    effect = Effect(
+        "settles", terms, "time", "onset", (1.0,), 0.0, Scope(camera=("left",)), (2.0, -1.0)
+    )
+    scene = stereo_recording(noise=noise).true_scene()
+    return adjust(scene.with_effects((effect,), scene.room), rtol=1e-14)
+
+
+@pytest.fixture(scope="module")
+def bent():
+    return settling(1.0)
+
+
+def blocks_of(scene, residuals):
+    """Residuals without the padding of the tables, in one array [residuals, ...]."""
+    pixels = [np.asarray(b)[: len(r)] for b, r in zip(residuals.pixels, scene.tables, strict=True)]
+    blocks = [*pixels, *jax.tree.leaves(residuals[1:])]
+    return np.concatenate([np.reshape(b, (-1, *b.shape[2:])) for b in blocks])
+
+
+def weights_of(fitted):
+    """Influence of all residuals on every parameter of the state."""
+    return influence(fitted, np.arange(fitted.problem.network.layout.size))
+
+
+def flat(state) -> np.ndarray:
+    return np.concatenate([np.ravel(np.asarray(getattr(state, f.name))) for f in fields(state)])
+
+
+def test_weights_squared_are_the_variance_in_white_noise(bent):
+    weights = blocks_of(bent.scene, weights_of(bent))
+    deviations = flat(standard_deviations(bent))
+    # NaN where nothing is observed: room for more effects.
+    live = np.isfinite(deviations)
+    assert np.count_nonzero(deviations[live]) > 50
+    variance = np.sum(weights**2, axis=0)
+    np.testing.assert_allclose(np.sqrt(variance[live]), deviations[live], rtol=1e-6)
+
+
+def test_weights_foretell_what_a_little_more_noise_does(bent):
+    more = settling(1.001)
+    before = residual(bent.scene.state, bent.scene.network)
+    after = residual(bent.scene.state, more.scene.network)
+    change = blocks_of(bent.scene, after) - blocks_of(bent.scene, before)
+    moved = flat(more.scene.state) - flat(bent.scene.state)
+    foretold = -blocks_of(bent.scene, weights_of(bent)).T @ change
+    scale = flat(standard_deviations(bent))
+    live = np.isfinite(scale) & (scale > 0.0)
+    moved, foretold = (change[live] / scale[live] for change in (moved, foretold))
+    assert np.abs(foretold).max() > 1e-3
+    np.testing.assert_allclose(moved, foretold, atol=0.02 * np.abs(foretold).max())
+
+
+def test_what_noise_does_to_an_effect_is_dense(bent):
+    c, scene = Correlation(0.4, 0.6, 0.1, 0.9), bent.scene
+    obs, layout = scene.recording.observations, bent.problem.network.layout
+    own = np.concatenate([layout.all("amplitude")[:2], layout.all("constant")[:1]])
+    found = influence(bent, own)
+    pixels = np.zeros((len(obs.epoch), 2, 3))
+    for rows, block in zip(scene.tables, found.pixels, strict=True):
+        pixels[rows] = block
+    apart = np.abs(np.subtract.outer(obs.epoch, obs.epoch))
+    camera = obs.camera[:, None] == obs.camera
+    mark = camera & (obs.target[:, None] == obs.target) & (obs.point[:, None] == obs.point)
+    dense = 0.5 * np.eye(len(apart)) + 0.4 * mark * 0.6**apart + 0.1 * camera * 0.9**apart
+    weights, of_pixels = blocks_of(scene, found), np.einsum("rci,rcj->ij", pixels, pixels)
+    white = weights.T @ weights
+    correlated = np.einsum("rci,rs,scj->ij", pixels, dense, pixels, optimize=True)
+    # Ranges and priors are white.
+    correlated += white - of_pixels
+    (one,) = met(bent, c)
+    np.testing.assert_allclose(one.ratio, np.diagonal(correlated) / np.diagonal(white), rtol=1e-9)
+    eigenvalues = eigh(correlated[:2, :2], white[:2, :2], eigvals_only=True)
+    assert one.inflation * one.freedom == pytest.approx(eigenvalues.sum())
+    assert one.inflation == pytest.approx(np.sum(eigenvalues**2) / eigenvalues.sum())
+    (white_one,) = met(bent, Correlation())
+    assert (white_one.inflation, white_one.freedom) == (1.0, 2) and np.all(white_one.ratio == 1.0)
+
+
+def test_there_may_be_no_effect():
+    assert met(adjusted("board")[1], Correlation(0.3, 0.6)) == []

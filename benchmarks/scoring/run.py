@@ -53,7 +53,7 @@ def some(families, wanted: int):
 
 def one(epochs: int, wanted: list[int]) -> dict:
     """Times of scoring so many hypotheses on a scene of so many epochs, and of refitting one."""
-    from jaxvm.discover.noise import multipliers
+    from jaxvm.discover.noise import random_signs
     from jaxvm.discover.score import ScoreTests
     from jaxvm.discover.space import enumerate_hypotheses, member
     from jaxvm.network.scene import build
@@ -75,7 +75,7 @@ def one(epochs: int, wanted: list[int]) -> dict:
         few = some(families, number)
         for flips in (0, 299):
             seconds = []
-            signs = multipliers(len(recording.time), 1, flips, 0) if flips else None
+            signs = random_signs(len(recording.time), flips, 0) if flips else None
             for _ in range(ROUNDS + 1):
                 began = time.perf_counter()
                 ranking = ScoreTests.of(fit, few).score(1.0, signs)

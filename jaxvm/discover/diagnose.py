@@ -11,7 +11,6 @@ from dataclasses import replace
 import numpy as np
 
 from jaxvm.discover.advice import advise
-from jaxvm.discover.correlation import Correlation, met
 from jaxvm.discover.diagnosis import Diagnosis, Finding, Quality
 from jaxvm.discover.gross import without_gross_errors
 from jaxvm.discover.heldout import (
@@ -22,6 +21,7 @@ from jaxvm.discover.heldout import (
     split,
 )
 from jaxvm.discover.locate import ResidualTable, locate, residual_table
+from jaxvm.discover.noise import Correlation, met
 from jaxvm.discover.scatter import ALIKE, likeness
 from jaxvm.discover.scopes import sharing
 from jaxvm.discover.search import ALPHA, Search

@@ -1,11 +1,12 @@
 """What the scores say: which hypotheses lead, and how likely noise alone gives as much."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 from scipy.special import gammaln
 
+from jaxvm.discover.courses import Course
 from jaxvm.discover.hypotheses import Family, Hypothesis
 from jaxvm.discover.space import member
 from jaxvm.network.scene import Scene
@@ -22,9 +23,7 @@ class Scores:
         z: the same as a surprise, about -2 ln p, comparable whatever the number of columns.
         amplitude: one-step amplitudes [groups, courses, scopes, columns].
         seen: share of the effect that the model does not absorb.
-        inflation, freedom: the drop under the multipliers is about `inflation` times a chi-square
-            of so many degrees of freedom (Satterthwaite 1946).
-        null: largest z of each group under the multipliers [groups, repetitions].
+        null: largest z of each group under flipped signs [groups, repetitions].
         valid: hypotheses that were scored.
     """
 
@@ -33,8 +32,6 @@ class Scores:
     z: np.ndarray
     amplitude: np.ndarray
     seen: np.ndarray
-    inflation: np.ndarray
-    freedom: np.ndarray
     null: np.ndarray
     valid: np.ndarray
     variance: float
@@ -155,6 +152,21 @@ def spread_of_constant(ranking: Ranking, hypothesis: Hypothesis, scene: Scene) -
         step = float(np.median(np.diff(np.unique(at)))) if len(at) > 1 else 0.0
         return float(np.hypot(np.sqrt(weight @ (at - mean) ** 2 / weight.sum()), step / 3.5))
     return 0.0
+
+
+def begun_slowly(ranking: Ranking, hypothesis: Hypothesis, scene: Scene) -> Hypothesis | None:
+    """What settles from the moment of a step on, in the same terms at the same place, if asked.
+
+    It contains the step, but the grid of its two constants is too coarse to show it.
+    """
+    course, time = hypothesis.course, np.asarray(scene.network.channels.epoch_time)
+    if course.form != "step" or len(time) < 2:
+        return None
+    pause = float(np.median(np.diff(time)))
+    slow = Course(course.driver, "settling", (max(course.constants[0] - 0.5 * pause, 0.0), pause))
+    for scores, g, own, s in _where(ranking, replace(hypothesis, course=slow), scene):
+        return replace(member(scores.family, (g, own[0], s), scene), course=slow)
+    return None
 
 
 def _where(ranking: Ranking, hypothesis: Hypothesis, scene: Scene):

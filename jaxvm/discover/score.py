@@ -98,23 +98,18 @@ class ScoreTests:
         variance: float,
         signs: Float[np.ndarray, "epochs repetitions"] | None = None,
         residual: Float[np.ndarray, "observations components"] | None = None,
-        studentised: bool = False,
     ) -> Ranking:
         """Score all hypotheses against the residuals of the fit, or against another vector.
 
-        `variance` is that of unit weight; `signs` flip whole epochs for the null distribution
-        (`jaxvm.discover.noise.multipliers`); None where it is not wanted.
-
-        Noise with a memory makes smooth hypotheses look good and hardly touches the others. With
-        `studentised` each statistic is compared with its own distribution under the multipliers:
-        every hypothesis is judged by the noise that it meets.
+        `variance` is that of unit weight; `signs` flip whole epochs for the null distribution;
+        None where it is not wanted.
 
         With another vector e (whitened, like all observations) the drop is the part of what the
         model does not absorb of it that a hypothesis explains: how much it resembles e.
         """
         cells = self.arrangement.cells
         e = cells.residual if residual is None else self.arrangement.in_cells(residual)
-        tested = _Tested.of(cells, e, variance, signs, studentised)
+        tested = _Tested.of(cells, e, variance, signs)
         self._evaluate_patterns()
         # NumPy lets other threads run while it multiplies.
         with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -126,7 +121,7 @@ class ScoreTests:
         family, parts = self.battery.families[number], self.battery.parts[number]
         shape = family.valid.shape
         drop, z, seen = np.zeros(shape), np.full(shape, -np.inf), np.zeros(shape)
-        inflation, freedom, sound = np.ones(shape), np.ones(shape), np.zeros(shape, bool)
+        sound = np.zeros(shape, bool)
         amplitude = np.zeros((*shape, family.n_terms * family.n_bases))
         null = np.full((shape[0], tested.repetitions), -np.inf)
         wanted = [
@@ -149,16 +144,12 @@ class ScoreTests:
                 known = self._known[key]
                 seen[here], sound[here] = known.seen, known.sound
                 drop[here], amplitude[here] = drop_of(known, part, product)
-                freedom[here] = amplitude.shape[-1]
                 if shared is not None and tested.flips and known.sound.any():
-                    found = _flipped(known, part, product, shared, tested)
-                    inflation[here], freedom[here] = found[:2]
-                    null[g] = np.maximum(null[g], found[2])
+                    null[g] = np.maximum(null[g], _flipped(known, part, product, shared, tested))
         for part in parts:
             part.forget()
-        z[sound] = surprise(drop[sound] / tested.variance / inflation[sound], freedom[sound])
-        found = drop, z, amplitude, seen, inflation, freedom, null, sound
-        return Scores(family, *found, tested.variance)
+        z[sound] = surprise(drop[sound] / tested.variance, amplitude.shape[-1])
+        return Scores(family, drop, z, amplitude, seen, null, sound, tested.variance)
 
     def _tangents(self, family: Family, residual: np.ndarray, full: bool) -> Iterator[Tangents]:
         """Products of the tangents of each group, some groups and some cells at a time.
@@ -240,10 +231,9 @@ class _Tested:
     n_fitted: float  # epochs with residuals
     variance: float
     signs: Float[np.ndarray, "epochs repetitions"] | None
-    studentised: bool
 
     @classmethod
-    def of(cls, cells: Cells, e: np.ndarray, variance: float, signs, studentised: bool):
+    def of(cls, cells: Cells, e: np.ndarray, variance: float, signs):
         """A vector e in cells; at the minimum the model explains nothing more of it."""
         residual = cells.projected(e)
         half = cells.half[:, :, cells.n_local :]
@@ -252,7 +242,7 @@ class _Tested:
         np.add.at(pull, cells.epoch_of, of_cell)
         touched = np.bincount(cells.epoch_of, np.sum(e**2, axis=1), cells.n_epochs) > 0.0
         n_fitted = max(float(touched.sum()), 2.0)
-        return cls(residual, pull, n_fitted, variance, signs, studentised)
+        return cls(residual, pull, n_fitted, variance, signs)
 
     @property
     def flips(self) -> bool:
@@ -273,9 +263,8 @@ def _key(term: Term) -> tuple:
 def _flipped(
     known: Information, part: Part, product: np.ndarray, shared: np.ndarray, tested: _Tested
 ):
-    """Inflation and freedom of each course [b], and the largest z of each repetition."""
+    """The largest z of each repetition."""
     place, sound = part.place, known.sound
-    b, columns, _ = shared.shape
     padded = np.concatenate([at_cells(product, place.cells), np.zeros((1, product.shape[1]))])[
         place.epoch
     ]
@@ -284,11 +273,4 @@ def _flipped(
     # A fitted residual lacks what the shared unknowns take of its epoch, about 1/epochs.
     lost = max(1.0 - 1.0 / tested.n_fitted, 0.5)
     null = np.sum((scores @ tested.signs) ** 2, axis=1) / (lost * tested.variance)
-    inflation, freedom = np.ones(b), np.full(b, float(columns))
-    if not tested.studentised:
-        return inflation, freedom, surprise(null.max(axis=0), columns)
-    mean, spread = null.mean(axis=1), null.var(axis=1)
-    inflation[sound] = np.maximum(0.5 * spread / mean, 1.0)
-    freedom[sound] = np.clip(2.0 * mean**2 / spread, 1.0, columns)
-    each = surprise(null / inflation[sound, None], freedom[sound, None])
-    return inflation, freedom, each.max(axis=0)
+    return surprise(null.max(axis=0), shared.shape[1])

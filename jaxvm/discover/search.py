@@ -6,14 +6,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from jaxvm.discover.accept import Accepted, accept, short
-from jaxvm.discover.correlation import Correlation, Met, met
 from jaxvm.discover.detail import with_detail
 from jaxvm.discover.diagnosis import Finding
 from jaxvm.discover.heldout import HeldOut, Split, gain
 from jaxvm.discover.hypotheses import FREE, Hypothesis
-from jaxvm.discover.noise import LONGEST, memory, multipliers
+from jaxvm.discover.noise import Correlation, Met, met, random_signs
 from jaxvm.discover.pairs import better_pair, other_beginnings, worth_a_second_thought
-from jaxvm.discover.ranking import Ranking, spread_of_constant, surprise
+from jaxvm.discover.ranking import Ranking, begun_slowly, spread_of_constant, surprise
 from jaxvm.discover.revise import lost_without, prune, rename, with_effects
 from jaxvm.discover.rivals import rivals
 from jaxvm.discover.scatter import ALIKE, likeness, of_each_image
@@ -43,6 +42,9 @@ _TRIED_AGAIN, _HOPEFUL = 6, 0.75
 
 _WORSE = 1.01
 """Rise of the held-out RMS that other names may bring: what differs less is noise."""
+
+_BEGINNINGS = 4
+"""Leading hypotheses among which a step is tried as a slow beginning, too."""
 
 _WIDER = 1.2
 """Inflation by noise from which the rivals of a finding are weighed again: more of them stay."""
@@ -84,7 +86,7 @@ class Search:
     _superfluous: set = field(default_factory=set)
 
     def __post_init__(self) -> None:
-        self._signs = multipliers(len(self.parts.held), 1, FLIPS, self.seed)
+        self._signs = random_signs(len(self.parts.held), FLIPS, self.seed)
         families = enumerate_hypotheses(self.current.scene)
         self._tests = ScoreTests.of(self.current, families)
 
@@ -116,6 +118,7 @@ class Search:
             first = first or self.ranking
             if len(self.findings) == most:
                 break
+            leading = self._with_slow_beginnings(leading)
             accepted = self._accepted(leading, progress)
             if accepted is None:
                 # What no course explains may be a wave, or differ from image to image.
@@ -144,6 +147,16 @@ class Search:
         if self.p_value > self.alpha and foremost:
             self.p_value = self._p_without(*foremost[0][::2])
         return foremost
+
+    def _with_slow_beginnings(self, leading):
+        """The leading ones, and right after each step what settles from its moment on."""
+        found = []
+        for hypothesis, evidence, amplitudes in leading:
+            found.append((hypothesis, evidence, amplitudes))
+            slow = begun_slowly(self.ranking, hypothesis, self.current.scene)
+            if slow is not None and len(found) <= _BEGINNINGS:
+                found.append((slow, evidence, amplitudes))
+        return found
 
     def _accepted(self, leading, progress: Callable[[str], None]) -> Accepted | None:
         """The hypothesis that is significant and that the held-out epochs prove."""
@@ -301,30 +314,24 @@ class Search:
         return findings
 
     def _confirmed(self) -> list[Finding]:
-        """Findings with their p-values under noise that remembers as long as what is left now.
+        """Findings with their p-values under noise that is as correlated as what is left now.
 
         Noise with a memory looks like a smooth effect, and so does an effect that is not found yet:
         that is why earlier findings are looked at again after each new one.
         """
-        scene, residual = self.current.scene, self.parts.residuals(self.current)
-        noise = met(self.current, Correlation.of(self.current, residual))[self.given :]
-        found = [replace(f, noise=m.inflation) for f, m in zip(self.findings, noise, strict=True)]
-        # Without a clock neighbours in the list are alike for other reasons (the board's attitude).
-        timed = scene.recording.timed
-        window = memory(scene, residual) if timed else 1
-        if window == 1:
+        noise = Correlation.of(self.current, self.parts.residuals(self.current))
+        own = met(self.current, noise)[self.given :]
+        found = [replace(f, noise=m.inflation) for f, m in zip(self.findings, own, strict=True)]
+        if noise.white:
             return [replace(f, p_value=f.p_independent) for f in found]
-        n_epochs = len(scene.recording.time)
-        window = min(2 * window, max(int(LONGEST * n_epochs), 2))
-        remembering = multipliers(n_epochs, window, FLIPS, self.seed)
         variance = robust_variance(self.current)
-        left = self._tests.score(variance, remembering, stacked(self.current), studentised=True)
+        left = self._tests.score(variance, self._signs, stacked(self.current))
 
-        def again(finding: Finding, own: Met) -> Finding:
-            z = float(surprise(np.array(finding.drop / variance / own.inflation), own.freedom))
+        def again(finding: Finding, met: Met) -> Finding:
+            z = float(surprise(np.array(finding.drop / variance / met.inflation), met.freedom))
             return replace(finding, p_value=max(left.p_value(z), finding.p_independent))
 
-        return [again(finding, own) for finding, own in zip(found, noise, strict=True)]
+        return [again(finding, met) for finding, met in zip(found, own, strict=True)]
 
     def _settle(self) -> None:
         """Drop what noise with a memory explains, and give the findings their last names."""
