@@ -336,11 +336,12 @@ class Search:
     def _settle(self) -> None:
         """Drop what noise with a memory explains, and give the findings their last names."""
         parts = self.parts
-        unconfirmed = [f.p_value for f in self.findings if f.p_value > self.alpha]
-        if unconfirmed:
+        # What a finding that goes had taken of the noise counts for the others again.
+        while unconfirmed := [f.p_value for f in self.findings if f.p_value > self.alpha]:
             self.p_value = min(unconfirmed)
             self._drop_unconfirmed()
             self.current, self.heldout = parts.proven(self.current)
+            self.findings = self._confirmed()
         names = [finding.hypothesis for finding in self.findings]
         if len(names) > 1:
             self._rename()
