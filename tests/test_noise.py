@@ -54,16 +54,18 @@ def moving():
     return board(frozenset({"pose"}), 8)
 
 
-def shown(fitted, seed, mark=0.0, of_mark=0.0, image=0.0, of_image=0.0) -> Correlation:
-    """What is found in white noise, what marks remember and what the marks of an image share.
-
-    The unknowns of each epoch take their part of it.
-    """
+def correlated(scene, seed, mark=0.0, of_mark=0.0, image=0.0, of_image=0.0) -> np.ndarray:
+    """White noise, what marks remember and what the marks of an image share; [observations, 2]."""
     rng = np.random.default_rng(seed)
     courses = np.sqrt(1.0 - mark - image) * rng.standard_normal((N_EPOCHS, 30, 2))
     courses += np.sqrt(mark) * autoregressive(rng, of_mark, (N_EPOCHS, 30, 2))
     courses += np.sqrt(image) * autoregressive(rng, of_image, (N_EPOCHS, 1, 2))
-    noise = of_marks(fitted.scene, courses)
+    return of_marks(scene, courses)
+
+
+def shown(fitted, seed, *shares) -> Correlation:
+    """What is found in noise of which the unknowns of each epoch have taken their part."""
+    noise = correlated(fitted.scene, seed, *shares)
     half, group = local_rows(fitted)
     along = np.zeros((group.max() + 2, half.shape[2]))
     np.add.at(along, group, np.einsum("ncd,nc->nd", half, noise))
@@ -204,3 +206,29 @@ def test_what_noise_does_to_an_effect_is_dense(bent):
 
 def test_there_may_be_no_effect():
     assert met(adjusted("board")[1], Correlation(0.3, 0.6)) == []
+
+
+def test_intervals_hold_in_correlated_noise(still):
+    """The drift of an image is in its 90 % interval as often as that, and not in white noise's."""
+    terms = (Term("detect.u"), Term("detect.v"))
+    drift = Effect("drifts", terms, "time", "linear", (), 100.0, Scope(), (0.0, 0.0))
+    scene = still.scene
+    fitted = adjust(scene.with_effects((drift,), scene.room))
+    own = fitted.problem.network.layout.all("amplitude")[:2]
+    weights = np.zeros((len(scene.recording.observations.epoch), 2, 2))
+    for rows, block in zip(fitted.scene.tables, influence(fitted, own).pixels, strict=True):
+        weights[rows] = block
+    flat = weights.reshape(-1, 2)
+    inside, inside_white = [], []
+    for seed in range(100):
+        noise = correlated(scene, seed, 0.3, 0.7, 0.03, 0.8)
+        error = flat.T @ noise.ravel()
+        # The fitted drift takes its part of the noise.
+        left = noise - (flat @ np.linalg.solve(flat.T @ flat, error)).reshape(noise.shape)
+        (one,) = met(fitted, Correlation.of(fitted, left))
+        std = np.sqrt(np.sum(flat**2, axis=0))
+        inside += list(np.abs(error) < 1.645 * np.sqrt(one.ratio) * std)
+        inside_white += list(np.abs(error) < 1.645 * std)
+    # Three standard deviations of a share of 200.
+    assert abs(np.mean(inside) - 0.9) < 0.064
+    assert np.mean(inside_white) < 0.6
