@@ -271,11 +271,15 @@ def _against_driver(diagnosis, finding, before, after, shift, fitted) -> Figure:
     values = np.asarray(channels.values[channels.index(driver)])
     x = np.interp(recording.time, np.asarray(channels.time), values)
     label = driver.replace("_", " ")
+    time, unit = _readable(recording.time - recording.time[0])
+    panels = [(time, f"time ({unit})")]
     if driver.startswith("time"):
-        x, label = x / 3600.0, f"{driver} (h)"
-    figure, axes = _figure(9.0, 3.2, 2)
-    hours = (recording.time - recording.time[0]) / 3600.0
-    for axis, over, name in ((axes[0, 0], x, label), (axes[0, 1], hours, "time (h)")):
+        x, unit = _readable(x)
+        label = f"{label} ({unit})"
+    if driver != "time":
+        panels.insert(0, (x, label))
+    figure, axes = _figure(9.0, 3.2, len(panels))
+    for axis, (over, name) in zip(axes[0], panels, strict=True):
         order = np.argsort(over)
         loop = finding.effect.form in ("hysteresis", "direction", "lag", "two lags", "rate")
         line = slice(None) if loop else order
@@ -287,6 +291,15 @@ def _against_driver(diagnosis, finding, before, after, shift, fitted) -> Figure:
         axis.set(xlabel=name, ylabel="residual along the effect (px)")
     axes[0, 0].legend(fontsize=8)
     return figure
+
+
+def _readable(seconds: np.ndarray) -> tuple[np.ndarray, str]:
+    """Times in the unit that suits their span, and the unit."""
+    span = float(np.ptp(seconds))
+    unit, name = next(
+        ((u, n) for u, n in ((3600.0, "h"), (60.0, "min")) if span > 3 * u), (1.0, "s")
+    )
+    return seconds / unit, name
 
 
 def _pixels_per_sigma(diagnosis: Diagnosis) -> float:

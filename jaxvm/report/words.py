@@ -15,6 +15,9 @@ from jaxvm.physics.forms import FORMS
 from jaxvm.physics.materials import length_of, materials_for
 from jaxvm.physics.ports import PORTS
 
+_HOPELESS = 0.05
+"""Chance to decide below which a further recording is no advice."""
+
 _PORT = {port.name: port for port in PORTS}
 
 _PER_DRIVER = {"linear": 1, "lag": 1, "slow lag": 1, "play": 1, "square": 2, "ramp": 1, "rate": 1}
@@ -182,14 +185,17 @@ def mistaken_for(finding: Finding) -> str:
 
 
 def separate_by(finding: Finding) -> str:
-    """The recording that would tell it from its doubles."""
-    if finding.advice:
-        best = finding.advice[0]
-        rival = best.rivals[int(np.argmin(best.chances))].effect(()).name
-        told = f"expected odds {odds(best.odds)}, a chance of {best.chance:.0%} to tell it from"
-        return f"record {best.plan.words}: {told} “{rival}”"
+    """The recording that would part it from its doubles, the catalogue's where none would."""
     entries = finding.hypothesis.entries
-    return entries[0].separate_by if entries else "another driver's range, another geometry"
+    other = entries[0].separate_by if entries else "another driver's range, another geometry"
+    if not finding.advice:
+        return other
+    best = finding.advice[0]
+    rival = best.rivals[int(np.argmin(best.chances))].effect(()).name
+    if best.chance < _HOPELESS:
+        return f"{other} (no recording that was weighed tells it from “{rival}”)"
+    told = f"expected odds {odds(best.odds)}, a chance of {best.chance:.0%} to tell it from"
+    return f"record {best.plan.words}: {told} “{rival}”"
 
 
 def odds(value: float) -> str:
