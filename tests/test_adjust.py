@@ -87,6 +87,17 @@ def test_result_tells_what_happened():
     assert not few.converged and "2 evaluations" in few.why
 
 
+def test_what_is_out_of_reach_is_given_up():
+    known = board_recording()
+    off = nudged(known, known.true_scene(), 1e-3)
+    whole = adjust(off)
+    within = adjust(off, wanted=1.01 * whole.cost)
+    assert within.cost == whole.cost and within.why == whole.why
+    beyond = adjust(off, wanted=0.9 * whole.cost)
+    assert not beyond.converged and not beyond.failed
+    assert beyond.why.startswith("given up") and beyond.evaluations < whole.evaluations
+
+
 def test_unknown_method_is_refused():
     known = board_recording()
     with pytest.raises(ValueError, match='no method "newton".*gauss-newton.*levenberg-marquardt|'

@@ -83,14 +83,15 @@ class Split:
         """Number of pixel coordinates that are fitted."""
         return sum(int(w.sum()) * 2 for w in self.weights)
 
-    def fit(self, scene: Scene, check: bool = False) -> Adjustment:
-        """Adjustment of a scene to the fitted epochs."""
+    def fit(self, scene: Scene, check: bool = False, wanted: float = np.inf) -> Adjustment:
+        """Adjustment of a scene to the fitted epochs, given up where it won't get to a cost."""
         return adjust(
             scene,
             weights=self.weights,
             range_weights=self.range_weights,
             rtol=1e-9,
             damping=1e-6 if scene.effects else 1e-3,
+            wanted=wanted,
             check=check,
         )
 

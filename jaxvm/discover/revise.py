@@ -4,8 +4,8 @@ While a second effect was still missing, the first may have got the name of a ne
 superfluous now. What is no longer needed goes; a double that fits better takes the name.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 
@@ -16,7 +16,12 @@ from jaxvm.network.scene import Scene
 from jaxvm.solve.adjust import Adjustment
 from jaxvm.solve.covariance import wald_drops
 
-Fit = Callable[[Scene], Adjustment]
+
+class Fit(Protocol):
+    """Adjusts a scene, or gives it up where it won't get to the cost that is wanted."""
+
+    def __call__(self, scene: Scene, *, wanted: float = ...) -> Adjustment: ...
+
 
 _MOST_TRIED = 12
 """Alternatives that are fitted at most, those of the first findings first: what was named while
@@ -69,7 +74,9 @@ def _better(
     scene, given = current.scene, len(current.scene.effects) - len(findings)
     effects = list(scene.fitted_effects())
     effects[given + k] = other.effect(np.zeros(other.n_columns))
-    tried = fit(scene.with_effects(tuple(effects), scene.room))
+    # Even if it made all the others superfluous, it would have to come so far down.
+    saved = 0.5 * current.variance_factor * complexity(findings, current.variance_factor, n)
+    tried = fit(scene.with_effects(tuple(effects), scene.room), wanted=current.cost + saved)
     if not tried.converged:
         return current, findings, k
     renamed = replace(findings[k], hypothesis=other, stds=(), rivals=(), weight=1.0)

@@ -219,15 +219,22 @@ def capacity(effects: tuple[Effect, ...]) -> tuple[int, int]:
     return 4 * -(-columns // 4), 4 * -(-(constants + 1) // 4)
 
 
+_STEP = 80
+"""Steps in which the room for effects grows where it is wide, in columns."""
+
+
 def room_for(effects: tuple[Effect, ...], present: tuple[int, int]) -> tuple[int, int]:
     """The present room where the effects fit in, else a much wider one (free-form curves need it).
 
-    Few sizes of room mean few compiled programs.
+    Few sizes of room mean few compiled programs; but a very wide model costs more by the room that
+    it leaves empty than by another program.
     """
     columns, constants = capacity(effects)
     if columns <= present[0] and constants <= present[1]:
         return present
-    wide = 40 << max(-(-columns // 40) - 1, 0).bit_length()
+    wide = min(
+        40 << max(-(-columns // 40) - 1, 0).bit_length(), max(160, _STEP * -(-columns // _STEP))
+    )
     return wide, max(16 * -(-constants // 16), present[1])
 
 

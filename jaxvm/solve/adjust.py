@@ -143,6 +143,7 @@ def adjust(
     damping: float = 1e-3,
     max_steps: int = 100,
     repeats: int = 8,
+    wanted: float = np.inf,
     check: bool = True,
     mesh: Mesh | None = None,
 ) -> Adjustment:
@@ -164,6 +165,8 @@ def adjust(
         damping: first damping of Levenberg-Marquardt, relative to a unit diagonal.
         max_steps: bound on evaluations, each time.
         repeats: how often it may be repeated about the patterns of effects at the solution.
+        wanted: cost above which the solution is of no use: it is given up where it won't get
+            there (not with sparse factors, nor by descent).
         check: look for rank deficiency first.
         mesh: devices to share the observations out to (`jaxvm.solve.sharing`); one axis
             "observations". Not for sparse factors, which are on the host.
@@ -178,7 +181,7 @@ def adjust(
     began, compiling = time.perf_counter(), compile_seconds()
     options: dict = dict(weights=weights, range_weights=range_weights, link_weights=link_weights)
     options |= dict(active=active, loss=loss, mesh=mesh)
-    options |= dict(rtol=rtol, damping=damping, max_steps=max_steps)
+    options |= dict(rtol=rtol, damping=damping, max_steps=max_steps, wanted=wanted)
     found = _adjusted(scene, method, check=check, **options)
     before = np.inf
     for _ in range(repeats):
@@ -233,6 +236,7 @@ def _adjusted(
     rtol,
     damping,
     max_steps,
+    wanted,
     check,
     mesh,
 ) -> Adjustment:
@@ -262,7 +266,7 @@ def _adjusted(
         jnp.asarray(rtol), limit=jnp.asarray(max_steps), damping=jnp.asarray(damping)
     )
     shared = problem if mesh is None else SharedProblem.of(problem, mesh)
-    x, last = minimise(shared, normal, solver)
+    x, last = minimise(shared, normal, solver, wanted)
     history = np.asarray(last.history)
     return _result(
         scene,
@@ -364,6 +368,8 @@ def _state(problem: Problem, x):
 def _why(last, max_steps) -> str:
     if int(last.evaluations) >= max_steps:
         return f"stopped after {max_steps} evaluations: not converged"
+    if not bool(last.done):
+        return "given up: the cost that is wanted is out of reach"
     if last.result == optx.RESULTS.successful:
         return "converged: the cost no longer changes"
     return "failed: the normal equations are singular"

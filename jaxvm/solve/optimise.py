@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
@@ -18,6 +19,9 @@ from jaxvm.solve.arrow import ArrowCholesky
 from jaxvm.solve.problem import Normal, normal_at
 
 _HISTORY = 512
+
+_GRANTED, _SLOWEST = 3.0, 0.9
+"""What a minimisation may gain beyond what its steps promise, and the slowest rate it is given."""
 
 
 class HasNormal(Protocol):
@@ -145,11 +149,19 @@ class NormalEquationSolver(optx.AbstractLeastSquaresSolver):
         }  # fmt: skip
 
 
-def minimise(problem: HasNormal, normal: Normal, solver: NormalEquationSolver):
+def minimise(
+    problem: HasNormal, normal: Normal, solver: NormalEquationSolver, wanted: float = np.inf
+):
     """Drive a solver from x = 0, where the normal equations are known already.
 
     The same as `optimistix.least_squares`, step by step from outside, so that the one compiled
     program for the normal equations serves here, too; compiling is what most calls wait for.
+
+    Args:
+        problem: gives the normal equations at any x.
+        normal: these at x = 0.
+        solver: descent, search and rule to stop.
+        wanted: cost above which the solution is of no use: the drive ends where it won't get there.
 
     Returns:
         The solution x, the solver's last state.
@@ -157,9 +169,24 @@ def minimise(problem: HasNormal, normal: Normal, solver: NormalEquationSolver):
     info = _as_info(normal)
     y, state = _begin(solver, info)
     y, state = _advance(solver, y, state, info)
-    while not bool(state.done):
+    while not (bool(state.done) or (np.isfinite(wanted) and _out_of_reach(state, wanted))):
         y, state = _advance(solver, y, state, _as_info(problem.normal(state.trial)))
     return y, state
+
+
+def _out_of_reach(state: _State, wanted: float) -> bool:
+    """Whether the costs so far, gains shrinking as they do, end far above the one that is wanted.
+
+    Three accepted costs give the rate; steps to come promise the rest of the geometric series
+    (Aitken, 1926), and so many times more is granted.
+    """
+    costs = np.asarray(state.history)[: int(state.evaluations)]
+    accepted = np.append(costs[:1], costs[1:][np.diff(costs) < 0.0])
+    if len(accepted) < 3:
+        return False
+    first, last = -np.diff(accepted[-3:])
+    rate = min(last / first, _SLOWEST)
+    return bool(accepted[-1] - _GRANTED * last * rate / (1.0 - rate) > wanted)
 
 
 def _as_info(normal: Normal):
