@@ -4,12 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from networks import board_recording
 
+from jaxvm.discover.accept import STRONG
 from jaxvm.discover.courses import Course
+from jaxvm.discover.diagnose import _plain_fit
 from jaxvm.discover.groups import Group
 from jaxvm.discover.hypotheses import Hypothesis
-from jaxvm.discover.select import best_named, identity, log_prior
+from jaxvm.discover.select import best_named, identity, log_prior, refit
+from jaxvm.network.residual import predict_pixels
 from jaxvm.physics.catalogue import entries_for
+from jaxvm.physics.catalogue.entry import each
 from jaxvm.physics.effects import Scope, Term
 
 FOCAL = (Term("sensor.focal"),)
@@ -68,3 +73,31 @@ def test_a_parabola_contains_its_line():
     assert not DRIFT.contains(parabola)
     assert not replace(parabola, scope=Scope(camera=("right",))).contains(DRIFT)
     assert not replace(parabola, course=Course("room_degC", "quadratic")).contains(DRIFT)
+
+
+def test_depths_of_marks_do_not_run_away_with_the_poses():
+    """Depths that rise across the board are the board's pose: none of that is in what is found."""
+    known = board_recording(n_epochs=12)
+    obs, scope = known.recording.observations, Scope(target=("board",))
+    terms = each("mark", "target.point_z", numbers=range(30))
+    names = entries_for(terms, "target", ("constant",), "constant")
+    assert [entry.id for entry in names] == ["marks-of-other-depth"]
+    depths = Hypothesis(Group(terms, "target"), Course("constant", "constant"), scope, names)
+    true = 3e-4 * np.random.default_rng(4).standard_normal(30)
+    scene = known.true_scene().with_effects((depths.effect(true),), (40, 4))
+    pixel = np.zeros(obs.pixel.shape)
+    for rows, own in zip(scene.tables, predict_pixels(scene.state, scene.network), strict=True):
+        pixel[rows] = np.asarray(own)[: len(rows)]
+    pixel += obs.sigma[:, None] * np.random.default_rng(5).standard_normal(pixel.shape)
+    recording = replace(known.recording, observations=replace(obs, pixel=pixel))
+    parts, plain, _ = _plain_fit(known.true_scene(recording), 3)
+    # The poses could take back as much as a hundred times what is there.
+    found = refit(plain, depths, 3e-2 * np.ones(30), parts)
+    assert found is not None and found.evidence > STRONG
+    flat = np.column_stack([np.ones(30), known.recording.model.targets[0].points[:, :2]])
+
+    def beside_the_pose(z):
+        return z - flat @ np.linalg.lstsq(flat, z, rcond=None)[0]
+
+    np.testing.assert_allclose(beside_the_pose(found.amplitudes), beside_the_pose(true), atol=2e-4)
+    assert np.abs(found.amplitudes).max() < 1.5 * np.abs(true).max()

@@ -193,15 +193,16 @@ def refit(base: Adjustment, hypothesis: Hypothesis, amplitudes, split: Split) ->
             check=False,
         )
 
+    if len(amplitudes) > FREE:
+        # What some tiles or knots can't know, the others tell: their spread (empirical Bayes). What
+        # has a name begins with the spread that its name foresees: with none at all, what is nearly
+        # another pose would grow until it mimics something else.
+        middles = [float(np.sqrt(np.prod(entry.plausible))) for entry in hypothesis.entries]
+        scene = _with_spread(scene, min(middles)) if middles else scene
+        own = np.asarray(fit(scene).scene.fitted_effects()[-1].amplitudes)
+        scene = _with_spread(scene, float(np.median(np.abs(own))))
     fitted = fit(scene)
     effect = fitted.scene.fitted_effects()[-1]
-    if len(amplitudes) > FREE:
-        # What some tiles or knots can't know, the others tell: their spread (empirical Bayes).
-        size = float(np.median(np.abs(effect.amplitudes)))
-        own = replace(hypothesis.effect(0.0 * amplitudes), spread=_WIDE * size)
-        scene = scene.with_effects((*effects[:-1], own), scene.room)
-        fitted = fit(scene)
-        effect = fitted.scene.fitted_effects()[-1]
     if effect.constants and not (fitted.converged and _sensible(scene, effect)):
         # The grid's constants are good enough when a refined one runs away.
         fitted = fit(scene, hypothesis_constants_held(scene))
@@ -216,6 +217,12 @@ def refit(base: Adjustment, hypothesis: Hypothesis, amplitudes, split: Split) ->
     known = (*effects[:-1], replace(named.effect(0.0 * amplitudes), spread=effect.spread))
     fitted = replace(fitted, scene=replace(fitted.scene, effects=known))
     return Candidate(named, fitted, own)
+
+
+def _with_spread(scene: Scene, size: float) -> Scene:
+    """The scene with the prior of the last effect's amplitudes as wide as their size says."""
+    *others, last = scene.effects
+    return scene.with_effects((*others, replace(last, spread=_WIDE * size)), scene.room)
 
 
 def hypothesis_constants_held(scene: Scene) -> np.ndarray:
