@@ -48,6 +48,7 @@ def judge(
     row = {
         "id": entry["id"],
         "kind": entry["kind"],
+        "correlated": entry["noise"]["type"] == "correlated",
         "failed": report is None,
         "outside": any(truth.get("outside") for truth in hidden),
         "n_hidden": len(hidden),

@@ -82,7 +82,10 @@ def figures(rows: list[dict]) -> list[Figure]:
     empty = [r for r in rows if not r["n_hidden"]]
     sizes = [size for r in inside for size in r["set_names"]]
     claims = [size for r in inside for size in r["set_sizes"]]
-    z = [d for r in inside for e in r["effects"] if e["first"] for d in e["z"]]
+    sizes_right = [
+        (r["correlated"], covered(d)) for r in inside for e in r["effects"] if e["first"]
+        for d in e["z"]
+    ]  # fmt: skip
     constants = [
         d for r in inside for e in r["effects"] if e["first"] for d in e["z_constants"].values()
     ]
@@ -138,10 +141,14 @@ def figures(rows: list[dict]) -> list[Figure]:
         ),
         _share(
             "9", "true size inside the 90 % interval, right name first",
-            [covered(d) for d in z], 0.85, 0.95,
+            [hit for _, hit in sizes_right], 0.85, 0.95,
         ),
         _share(
-            "9b", "the same for time constants, periods and instants",
+            "9a", "the same where the noise is correlated",
+            [hit for correlated, hit in sizes_right if correlated], 0.0,
+        ),
+        _share(
+            "9b", "the same (9) for time constants, periods and instants",
             [covered(d) for d in constants], 0.0,
         ),
         _level("10", "seconds for a recording, median", [r.get("seconds") for r in rows], 0.5, "",

@@ -159,7 +159,7 @@ SHOWN = {
     "facts": vars(FACTS),
 }
 
-ENTRY = {"id": "r0000", "kind": "one", "hidden": [HIDDEN]}
+ENTRY = {"id": "r0000", "kind": "one", "hidden": [HIDDEN], "noise": {"type": "white"}}
 ROWS = {"mount-slip": (29,)}
 
 
@@ -175,7 +175,7 @@ def test_judge():
     row = judge(ENTRY, late, SHOWN, ROWS.get)
     assert not row["effects"][0]["place_right"]
     assert "wrong instant" in row["effects"][0]["reason"]
-    empty = judge({"id": "r0001", "kind": "nothing", "hidden": []}, REPORT, SHOWN | {"effects": []})
+    empty = judge(ENTRY | {"kind": "nothing", "hidden": []}, REPORT, SHOWN | {"effects": []})
     assert empty["false_claim"]
 
 
