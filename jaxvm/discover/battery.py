@@ -60,13 +60,20 @@ class Part:
         scope: which of the family's scopes.
         courses: which of the family's courses.
         place: the cells in scope.
-        weights: of each course at each of these cells.
+        table: all courses of the family, in each view.
+        view: of each of these cells.
     """
 
     scope: int
     courses: Int[np.ndarray, " b"]
     place: Place
-    weights: Float[np.ndarray, "b bases n"]
+    table: Float[np.ndarray, "courses bases views"]
+    view: Int[np.ndarray, " n"]
+
+    @once
+    def weights(self) -> Float[np.ndarray, "b bases n"]:
+        """Weights of each course at each of these cells."""
+        return self.table[self.courses][:, :, self.view]
 
     @once
     def by_group(self) -> Float[np.ndarray, "groups b_bases width"]:
@@ -93,7 +100,7 @@ class Part:
 
     def forget(self) -> None:
         """Drop what was gathered: it takes more room than time."""
-        for name in ("by_group", "by_epoch", "within"):
+        for name in ("weights", "by_group", "by_epoch", "within"):
             self.__dict__.pop(name, None)
 
 
@@ -116,9 +123,8 @@ def battery(scene: Scene, arrangement: Arrangement, families: tuple[Family, ...]
         for s in map(int, np.flatnonzero(asked.any(axis=0) & inside.any(axis=1))):
             if s not in places:
                 places[s] = Place.of(arrangement, inside[s])
-            courses, place = np.flatnonzero(asked[:, s]), places[s]
-            weights = table[courses][:, :, arrangement.view[place.cells]]
-            own.append(Part(s, courses, place, weights))
+            courses, view = np.flatnonzero(asked[:, s]), arrangement.view[places[s].cells]
+            own.append(Part(s, courses, places[s], table, view))
         parts.append(tuple(own))
     return Battery(families, tuple(parts))
 

@@ -46,7 +46,7 @@ from jaxvm.physics.ports import PORT_INDEX
 from jaxvm.solve.adjust import Adjustment
 
 _STACKED = 16
-"""Groups whose tangents are multiplied at a time."""
+"""Terms whose tangents are multiplied at a time, of as many groups as have them."""
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,8 @@ class ScoreTests:
         by_component = n, self.arrangement.components, -1
         # Of very many terms the products would take more room than the tangents.
         wide = family.n_terms > height
-        while some := tuple(islice(groups, 1 if wide else _STACKED)):
+        at_once = 1 if wide else max(_STACKED // family.n_terms, 1)
+        while some := tuple(islice(groups, at_once)):
             terms = [(group, term) for group in some for term in group.terms]
             ends = np.cumsum([len(group.terms) for group in some])
             own = [
