@@ -10,7 +10,7 @@ from networks import board_recording, free_points_recording, nudged
 from scipy.optimize import least_squares
 
 from jaxvm.solve.adjust import adjust
-from jaxvm.solve.arrow import Arrow, ArrowCholesky, factorise
+from jaxvm.solve.arrow import Arrow, NormalCholesky, factorise
 from jaxvm.solve.problem import normal_at, scaled, scene_problem
 
 NETWORKS = {"epochs": board_recording, "points": free_points_recording}
@@ -127,7 +127,7 @@ def test_solver_solves(size, damping):
     if damping is not None:
         shift = jnp.asarray(damping) * lx.IdentityLinearOperator(arrow.in_structure())
         operator, full = arrow + shift, full + damping * np.eye(n)
-    solution = lx.linear_solve(operator, jnp.asarray(v), solver=ArrowCholesky())
+    solution = lx.linear_solve(operator, jnp.asarray(v), solver=NormalCholesky())
     assert np.allclose(solution.value, np.linalg.solve(full, v), rtol=1e-10)
     block = np.random.default_rng(3).standard_normal((n, 2))
     if damping is None:
@@ -138,11 +138,11 @@ def test_solver_solves(size, damping):
 def test_solver_says_that_it_failed():
     arrow, full = random_arrow()
     bad = eqx.tree_at(lambda a: a.shared, arrow, arrow.shared - 1e3 * jnp.eye(4))
-    solution = lx.linear_solve(bad, jnp.ones(len(full)), solver=ArrowCholesky(), throw=False)
+    solution = lx.linear_solve(bad, jnp.ones(len(full)), solver=NormalCholesky(), throw=False)
     assert solution.result == lx.RESULTS.singular
-    with pytest.raises(TypeError, match="arrow"):
+    with pytest.raises(TypeError, match="normal matrices"):
         other = lx.MatrixLinearOperator(jnp.eye(3))
-        lx.linear_solve(other, jnp.ones(3), solver=ArrowCholesky())
+        lx.linear_solve(other, jnp.ones(3), solver=NormalCholesky())
 
 
 def test_untouched_unknowns_stay():

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from jaxvm.solve.arrow import factorise
 from jaxvm.solve.descent import Stop
 from jaxvm.solve.optimise import levenberg_marquardt
 from jaxvm.solve.problem import Problem
@@ -53,7 +52,7 @@ class GaussNewton(eqx.Module):
         def step(state):
             x, before, _, k = state
             normal = problem.normal(x)
-            change = -factorise(normal.hessian).solve(normal.gradient)
+            change = -normal.hessian.factorised().solve(normal.gradient)
             size = jnp.max(jnp.abs(change))
             return x + change, size, size * jnp.minimum(size / before, 1.0), k + 1
 

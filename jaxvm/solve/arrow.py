@@ -1,4 +1,4 @@
-"""Normal equations in arrow form, and the lineax solver that uses the form.
+"""Normal equations in arrow form, and the lineax solver of matrices that know their form.
 
     H = [ U   W^T ]     shared unknowns: U, dense
         [ W   V   ]     local unknowns: V, one small block for each group; W couples them to U
@@ -7,8 +7,9 @@ The local unknowns are eliminated first (Schur complement, batched small Cholesk
 system S = U - sum W^T V^-1 W is dense. Brown 1958; Triggs et al. 2000, section 6.
 """
 
+import abc
 import math
-from typing import Any
+from typing import Any, Protocol
 
 import equinox as eqx
 import jax
@@ -18,8 +19,47 @@ import lineax as lx
 from jaxtyping import Array, Bool, Float
 
 
-class Arrow(lx.AbstractLinearOperator):
-    """A symmetric positive (semi)definite matrix in arrow form, as a lineax operator.
+class CholeskyFactors(Protocol):
+    """Cholesky factors of a matrix."""
+
+    def solve(self, rhs: Float[Array, "n *k"]) -> Float[Array, "n *k"]: ...
+
+
+class NormalMatrix(lx.AbstractLinearOperator):
+    """A symmetric positive (semi)definite matrix that knows its form, as a lineax operator."""
+
+    @abc.abstractmethod
+    def diagonal(self) -> Float[Array, " n"]:
+        """Diagonal of the matrix."""
+
+    @abc.abstractmethod
+    def add_diagonal(self, values: Float[Array, " n"]) -> "NormalMatrix":
+        """The matrix with a diagonal added."""
+
+    @abc.abstractmethod
+    def factorised(self) -> CholeskyFactors:
+        """Cholesky factors. Unknowns that no observation touches (zero diagonal) stay where they
+        are. A matrix that is not positive definite gives NaN."""
+
+    def as_matrix(self) -> Float[Array, "n n"]:
+        """The dense matrix, for tests and small problems."""
+        return jax.vmap(self.mv)(jnp.eye(self.in_size()))
+
+    def transpose(self) -> "NormalMatrix":
+        """Itself."""
+        return self
+
+    def in_structure(self) -> jax.ShapeDtypeStruct:
+        """Shape of the vectors it takes."""
+        return jax.eval_shape(self.diagonal)
+
+    def out_structure(self) -> jax.ShapeDtypeStruct:
+        """Shape of the vectors it gives."""
+        return self.in_structure()
+
+
+class Arrow(NormalMatrix):
+    """A symmetric positive (semi)definite matrix in arrow form.
 
     Vectors are ordered [shared | group 0 | group 1 | ...].
     """
@@ -60,22 +100,9 @@ class Arrow(lx.AbstractLinearOperator):
         a, b = self.split(values)
         return Arrow(self.shared + jnp.diag(a), self.coupling, self.local + jax.vmap(jnp.diag)(b))
 
-    def as_matrix(self) -> Float[Array, "n n"]:
-        """The dense matrix, for tests and small problems."""
-        return jax.vmap(self.mv)(jnp.eye(self.in_size()))
-
-    def transpose(self) -> "Arrow":
-        """Itself."""
-        return self
-
-    def in_structure(self) -> jax.ShapeDtypeStruct:
-        """Shape of the vectors it takes."""
-        s, groups, d = self.sizes
-        return jax.ShapeDtypeStruct((s + groups * d,), self.shared.dtype)
-
-    def out_structure(self) -> jax.ShapeDtypeStruct:
-        """Shape of the vectors it gives."""
-        return self.in_structure()
+    def factorised(self) -> "ArrowFactors":
+        """Cholesky factors (`factorise`)."""
+        return factorise(self)
 
 
 class ArrowFactors(eqx.Module):
@@ -120,25 +147,25 @@ def factorise(arrow: Arrow) -> ArrowFactors:
     )
 
 
-class ArrowCholesky(lx.AbstractLinearSolver[ArrowFactors]):
-    """Lineax solver for `Arrow` operators, alone or damped (`arrow + scalar * identity`)."""
+class NormalCholesky(lx.AbstractLinearSolver[CholeskyFactors]):
+    """Lineax solver for normal matrices, alone or damped (`matrix + scalar * identity`)."""
 
-    def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> ArrowFactors:
-        """Factorise. TypeError for an operator that is no (damped) arrow."""
-        return factorise(_as_arrow(operator))
+    def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> CholeskyFactors:
+        """Factorise. TypeError for an operator that is no (damped) normal matrix."""
+        return _as_normal(operator).factorised()
 
-    def compute(self, state: ArrowFactors, vector, options: dict[str, Any]):
+    def compute(self, state: CholeskyFactors, vector, options: dict[str, Any]):
         """Solve; the result is a failure if the matrix was not positive definite."""
         solution = state.solve(vector)
         finite = jnp.all(jnp.isfinite(solution))
         result = lx.RESULTS.where(finite, lx.RESULTS.successful, lx.RESULTS.singular)
         return jnp.where(finite, solution, 0.0), result, {}
 
-    def transpose(self, state: ArrowFactors, options: dict[str, Any]):
+    def transpose(self, state: CholeskyFactors, options: dict[str, Any]):
         """The matrix is symmetric."""
         return state, options
 
-    def conj(self, state: ArrowFactors, options: dict[str, Any]):
+    def conj(self, state: CholeskyFactors, options: dict[str, Any]):
         """The matrix is real."""
         return state, options
 
@@ -147,19 +174,18 @@ class ArrowCholesky(lx.AbstractLinearSolver[ArrowFactors]):
         return True
 
 
-def _as_arrow(operator: lx.AbstractLinearOperator) -> Arrow:
-    if isinstance(operator, Arrow):
+def _as_normal(operator: lx.AbstractLinearOperator) -> NormalMatrix:
+    if isinstance(operator, NormalMatrix):
         return operator
     if isinstance(operator, lx.TaggedLinearOperator):
-        return _as_arrow(operator.operator)
+        return _as_normal(operator.operator)
     if isinstance(operator, lx.AddLinearOperator):
-        arrow, shift = _as_arrow(operator.operator1), operator.operator2
+        matrix, shift = _as_normal(operator.operator1), operator.operator2
         if isinstance(shift, lx.MulLinearOperator) and isinstance(
             shift.operator, lx.IdentityLinearOperator
         ):
-            scalar = jnp.broadcast_to(shift.scalar, (arrow.in_size(),))
-            return arrow.add_diagonal(scalar)
-    raise TypeError(f"ArrowCholesky solves arrow matrices, not {type(operator).__name__}")
+            return matrix.add_diagonal(jnp.broadcast_to(shift.scalar, (matrix.in_size(),)))
+    raise TypeError(f"NormalCholesky solves normal matrices, not {type(operator).__name__}")
 
 
 for _property in (
@@ -170,9 +196,9 @@ for _property in (
     lx.is_upper_triangular,
     lx.is_negative_semidefinite,
 ):
-    _property.register(Arrow)(lambda operator: False)
+    _property.register(NormalMatrix)(lambda operator: False)
 for _property in (lx.is_symmetric, lx.is_positive_semidefinite):
-    _property.register(Arrow)(lambda operator: True)
+    _property.register(NormalMatrix)(lambda operator: True)
 for _transform in (lx.linearise, lx.materialise, lx.conj):
-    _transform.register(Arrow)(lambda operator: operator)
-lx.diagonal.register(Arrow)(lambda operator: operator.diagonal())
+    _transform.register(NormalMatrix)(lambda operator: operator)
+lx.diagonal.register(NormalMatrix)(lambda operator: operator.diagonal())

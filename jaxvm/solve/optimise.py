@@ -15,7 +15,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxvm.solve.arrow import ArrowCholesky
+from jaxvm.solve.arrow import NormalCholesky
 from jaxvm.solve.problem import Normal, normal_at
 
 _HISTORY = 512
@@ -217,7 +217,7 @@ def gauss_newton(
         atol=atol,
         limit=limit,
         norm=optx.max_norm,
-        descent=optx.NewtonDescent(linear_solver=ArrowCholesky()),
+        descent=optx.NewtonDescent(linear_solver=NormalCholesky()),
         search=optx.LearningRate(1.0),
     )
 
@@ -234,7 +234,7 @@ def levenberg_marquardt(
         atol=atol,
         limit=limit,
         norm=optx.max_norm,
-        descent=optx.DampedNewtonDescent(linear_solver=ArrowCholesky()),
+        descent=optx.DampedNewtonDescent(linear_solver=NormalCholesky()),
         search=Relaxing(damping=damping),
     )
 

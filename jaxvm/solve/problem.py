@@ -5,6 +5,8 @@ Observations that touch the same unknowns form a *packet*: their products are on
 product, and only the small packet blocks are scattered into the arrow.
 """
 
+from typing import Generic, TypeVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -17,7 +19,8 @@ from jaxvm.network.scene import Scene
 from jaxvm.network.state import Layout, State
 from jaxvm.network.unknowns import Unknowns
 from jaxvm.physics.blocks import rounded
-from jaxvm.solve.arrow import Arrow
+from jaxvm.solve.arrow import Arrow, NormalMatrix
+from jaxvm.solve.levels import Levels, Tridiagonal
 from jaxvm.solve.robust import Loss, SquaredLoss
 
 
@@ -82,12 +85,15 @@ def _best_width(counts: Int[np.ndarray, " packets"]) -> int:
     return min(widths, key=lambda width: np.sum(-(-counts // width)) * (width + _PACKET_COST))
 
 
-class Normal(eqx.Module):
+Matrix = TypeVar("Matrix", bound=NormalMatrix, covariant=True)
+
+
+class Normal(eqx.Module, Generic[Matrix]):
     """Cost, gradient and Gauss-Newton matrix at one x."""
 
     cost: Float[Array, ""]
     gradient: Float[Array, " n"]
-    hessian: Arrow
+    hessian: Matrix
 
 
 class Problem(eqx.Module):
@@ -100,6 +106,7 @@ class Problem(eqx.Module):
         factor: change of the parameter for a unit change of its unknown.
         active: unknowns that may move; the others stay at zero.
         loss: robust loss of whitened residuals.
+        levels: order of the unknowns in which the matrix is block-tridiagonal; None for an arrow.
     """
 
     network: Network
@@ -110,6 +117,7 @@ class Problem(eqx.Module):
     active: Bool[Array, " n"]
     loss: Loss
     sizes: tuple[int, int, int] = eqx.field(static=True)  # shared, groups, group size
+    levels: Levels | None = None
 
     @property
     def n(self) -> int:
@@ -158,6 +166,8 @@ class Problem(eqx.Module):
     def assembled(self, tables: list[Linearised]) -> Normal:
         """The same of tables that are linearised already."""
         own = [factor.slots.shape[1] for factor in self.network.factors()]
+        if self.levels is not None:
+            return assemble_levels(tables, self.packets, self.loss, self.levels)
         return assemble(tables, self.packets, own, self.loss, self.sizes)
 
 
@@ -245,6 +255,36 @@ def assemble(
             local = local.at[where, member[:, :, None], member[:, None, :]].add(own)
     arrow = Arrow(shared[:s, :s], coupling[:groups, :d, :s], local[:groups, :d, :d])
     return Normal(cost, gradient[:n], arrow)
+
+
+def assemble_levels(
+    tables: list[Linearised], packets_of: tuple[Packets, ...], loss: Loss, levels: Levels
+) -> Normal[Tridiagonal]:
+    """The same as `assemble`, of unknowns in levels."""
+    cost, gradient, products = jnp.zeros(()), jnp.zeros(len(levels.place) + 1), []
+    for table, packets in zip(tables, packets_of, strict=True):
+        square = jnp.sum(table.value**2, axis=1)
+        cost = cost + 0.5 * jnp.sum(loss.value(square))
+        root = jnp.sqrt(loss.weight(square))[:, None]
+        jacobian = table.jacobian * root[:, :, None]
+        own, product = packet_products(packets, jacobian, jacobian, table.value * root)
+        gradient = gradient.at[packets.columns].add(product)
+        products.append(jnp.ravel(own))
+    return Normal(cost, gradient[:-1], levels.matrix(jnp.concatenate(products)))
+
+
+def in_levels(problem: Problem) -> Problem:
+    """The problem with its unknowns in levels, where that is faster than an arrow.
+
+    Groups and effects, which all observations share, are left to the arrow.
+    """
+    s, groups, _ = problem.sizes
+    own = [factor.slots.shape[1] for factor in problem.network.factors()]
+    shared = any(at >= n for p, n in zip(problem.packets, own, strict=True) for at in p.live)
+    if groups or shared or not s:
+        return problem
+    levels = Levels.of([np.asarray(packets.columns) for packets in problem.packets], s)
+    return eqx.tree_at(lambda p: p.levels, problem, levels, is_leaf=lambda leaf: leaf is None)
 
 
 def packet_products(
