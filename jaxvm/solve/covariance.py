@@ -24,6 +24,9 @@ from jaxvm.solve.selected import SelectedInverse
 from jaxvm.solve.snooping import robust_variance
 from jaxvm.solve.sparse import Pattern, SparseFactors, sparse_normal
 
+_AT_ONCE = 8
+"""Columns of the Jacobian that are computed side by side."""
+
 
 def covariance(
     adjustment: Adjustment,
@@ -121,9 +124,11 @@ def influence(adjustment: Adjustment, positions: np.ndarray) -> Residuals:
 
 @eqx.filter_jit
 def _along(problem: Problem, x, steps: Float[Array, "n k"]) -> Residuals:
-    """Change of all residuals along each of some steps."""
+    """Change of all residuals along each of some steps, a few at a time: what is between a step and
+    its residuals takes far more room than they."""
     _, change = jax.linearize(problem.residual, x)
-    return jax.vmap(change, in_axes=1, out_axes=-1)(steps)
+    along = jax.lax.map(change, steps.T, batch_size=_AT_ONCE)
+    return jax.tree.map(lambda block: jnp.moveaxis(block, 0, -1), along)
 
 
 def pose_covariances(
