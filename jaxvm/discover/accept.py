@@ -18,8 +18,11 @@ STRONG = 20.0
 It can't follow the noise of single epochs, and the held-out third alone shows a weak effect badly.
 """
 
-_FREE_LEAST = 40.0
-"""Evidence that a free form must promise before it is fitted: with less it follows noise."""
+_FREE_LEAST, _FREE_LEAST_OF_EPOCHS = 20.0, 40.0
+"""Evidence that a free form must promise before it is fitted: with less it follows noise.
+
+One with an amount for every epoch follows whatever comes and goes, in held-out epochs, too.
+"""
 
 _TIE = 0.05
 _OPEN = 100.0, 0.02
@@ -64,7 +67,7 @@ def accept(
             key = (identity(hypothesis), hypothesis.course)
             best = max((c.evidence for c in refitted), default=-np.inf)
             free = len(amplitudes) > FREE
-            if key in hopeless or (free and foretold < max(best, _FREE_LEAST)):
+            if key in hopeless or (free and foretold < max(best, _least(hypothesis))):
                 continue
             candidate = refit(current, hypothesis, amplitudes, split)
             tried += [] if candidate is None else [candidate]
@@ -86,6 +89,12 @@ def accept(
                 return Accepted(candidate, others, shown, proof, tuple(tried))
             hopeless.add((identity(candidate.hypothesis), candidate.hypothesis.course))
     return short(leading[0][0])
+
+
+def _least(hypothesis: Hypothesis) -> float:
+    """Evidence that a free form must promise."""
+    of_epochs = any(term.driver == "epoch" for term in hypothesis.group.terms)
+    return _FREE_LEAST_OF_EPOCHS if of_epochs else _FREE_LEAST
 
 
 def _common_evidence(candidate: Candidate, all_candidates, current: Adjustment) -> float:

@@ -235,7 +235,7 @@ def verdict_sentence(diagnosis: Diagnosis) -> str:
         )
     if diagnosis.unproven:
         left += (
-            f"; its best name, “{diagnosis.unproven}”, does not improve the held-out epochs and is "
+            f"; its best name, “{diagnosis.unproven}”, is not proven by the held-out epochs and is "
             "not claimed"
         )
     if diagnosis.verdict == "unexplained":
