@@ -63,6 +63,33 @@ def few(most: int) -> dict:
     }
 
 
+def table(found: dict) -> str:
+    """results.md."""
+    bow, std, known = found["bow_mm"], found["bow_std_mm"], found["bow_mm_mrcal"]
+    lines = [
+        "# Diagnosis of sony-board",
+        "",
+        f"{found['processors']} processors, whole processes: {found['cold_seconds']:.0f} s with an "
+        f"empty compile cache, {found['warm_seconds']:.0f} s with a filled one; peak memory "
+        f"{found['peak_gb']:.1f} GB.",
+        "",
+        f"The bow: {bow[0]:.3f} ± {std[0]:.3f} and {bow[1]:.3f} ± {std[1]:.3f} mm; mrcal: "
+        f"{known[0]:.3f} and {known[1]:.3f} mm. Wanted: {WANTED_PX} px with at most 60 "
+        "coefficients.",
+        "",
+        "| one finding after the other | coefficients so far | held-out RMS (px) |",
+        "|---|---|---|",
+        *(f"| {name} | {n} | {px:.4f} |" for name, n, px in found["steps"]),
+        "",
+        "| all findings, with their last names | own coefficients | held-out RMS (px) |",
+        "|---|---|---|",
+        *(f"| {name} | {n} | {px:.4f} |" for name, n, px in found["all_findings"]),
+        "",
+        f"Fitted together they leave {found['heldout_px']:.4f} px.",
+    ]
+    return "\n".join(lines) + "\n"
+
+
 def main() -> None:
     with tempfile.TemporaryDirectory() as work:
         cache, out = f"{work}/compiled", f"{work}/report"
@@ -83,6 +110,7 @@ def main() -> None:
         "processors": os.cpu_count(),
     }
     (HERE / "results.json").write_text(json.dumps(results, indent=1) + "\n")
+    (HERE / "results.md").write_text(table(results))
     figure = Figure(figsize=(8, 3.2), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1, 1.6))
     left.bar(["cold", "warm"], [run["seconds"] for run in runs])
@@ -95,7 +123,7 @@ def main() -> None:
     right.set(xlabel="RMS on held-out frames (px)")
     right.legend(fontsize=7)
     figure.savefig(HERE / "results.png", dpi=120)
-    print(json.dumps(results, indent=1))
+    print(table(results))
 
 
 if __name__ == "__main__":
