@@ -12,7 +12,8 @@ need it. The settings below are made unless the environment already has them:
 - XLA drops optimization barriers before it fuses loops, and then computes a derivative again in
   every loop that needs it: barriers stay.
 - The C library gives blocks of some MB back to the system and takes the next ones anew, page
-  by page, which costs more than what is computed in them: up to 64 MB they are kept.
+  by page, which costs more than what is computed in them: up to 64 MB they are kept, for all
+  threads together.
 
 Compiled programs stay in the user's cache folder, so that a second run starts at once;
 JAX_COMPILATION_CACHE_DIR names another folder, JAX_ENABLE_COMPILATION_CACHE=false keeps none.
@@ -32,12 +33,13 @@ for _flag, _value in {
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("NPROC", str(max(8, os.cpu_count() or 1)))
 
-_M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_THRESHOLD = -1, -2, -3  # of <malloc.h>
+_M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -2, -3, -8  # of <malloc.h>
 if sys.platform == "linux" and not any("MALLOC" in name for name in os.environ):
     _mallopt = getattr(ctypes.CDLL(None), "mallopt", lambda *_: 0)
     _mallopt(_M_MMAP_THRESHOLD, 1 << 26)
     _mallopt(_M_TRIM_THRESHOLD, 1 << 28)
     _mallopt(_M_TOP_PAD, 1 << 25)
+    _mallopt(_M_ARENA_MAX, 1)
 
 import jax  # noqa: E402
 from platformdirs import user_cache_path  # noqa: E402
