@@ -11,11 +11,11 @@ from jaxvm.discover.courses import Course
 from jaxvm.discover.diagnose import _plain_fit
 from jaxvm.discover.groups import Group
 from jaxvm.discover.hypotheses import Hypothesis
-from jaxvm.discover.select import best_named, identity, log_prior, refit
+from jaxvm.discover.select import best_named, identity, log_prior, refit, sensible
 from jaxvm.network.residual import predict_pixels
 from jaxvm.physics.catalogue import entries_for
 from jaxvm.physics.catalogue.entry import each
-from jaxvm.physics.effects import Scope, Term
+from jaxvm.physics.effects import Effect, Scope, Term
 
 FOCAL = (Term("sensor.focal"),)
 DRIFT = Hypothesis(
@@ -73,6 +73,23 @@ def test_a_parabola_contains_its_line():
     assert not DRIFT.contains(parabola)
     assert not replace(parabola, scope=Scope(camera=("right",))).contains(DRIFT)
     assert not replace(parabola, course=Course("room_degC", "quadratic")).contains(DRIFT)
+
+
+@pytest.mark.parametrize("pauses, sound", [(0.3, False), (3.0, True), (1e4, False)])
+def test_what_settles_between_two_epochs_is_a_step(pauses, sound):
+    scene = board_recording().true_scene()
+    time = np.asarray(scene.network.channels.epoch_time)
+    pause = float(np.median(np.diff(time)))
+    slow = Effect(
+        "it settles",
+        (Term("mount.shift_x"),),
+        driver="time",
+        form="settling",
+        constants=(0.5 * float(time[-1]), pauses * pause),
+        scope=Scope(camera=("cam",)),
+        amplitudes=(1e-3,),
+    )
+    assert sensible(scene, slow) == sound
 
 
 def test_depths_of_marks_do_not_run_away_with_the_poses():

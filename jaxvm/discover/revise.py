@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxvm.discover.diagnosis import Finding
 from jaxvm.discover.hypotheses import Hypothesis
-from jaxvm.discover.select import price, price_of_columns
+from jaxvm.discover.select import price, price_of_columns, sensible
 from jaxvm.network.scene import Scene
 from jaxvm.solve.adjust import Adjustment
 from jaxvm.solve.covariance import wald_drops
@@ -77,7 +77,7 @@ def _better(
     # Even if it made all the others superfluous, it would have to come so far down.
     saved = 0.5 * current.variance_factor * complexity(findings, current.variance_factor, n)
     tried = fit(scene.with_effects(tuple(effects), scene.room), wanted=current.cost + saved)
-    if not tried.converged:
+    if not (tried.converged and sensible(tried.scene, tried.scene.fitted_effects()[given + k])):
         return current, findings, k
     renamed = replace(findings[k], hypothesis=other, stds=(), rivals=(), weight=1.0)
     new = [*findings[:k], renamed, *findings[k + 1 :]]

@@ -203,7 +203,7 @@ def refit(base: Adjustment, hypothesis: Hypothesis, amplitudes, split: Split) ->
         scene = _with_spread(scene, float(np.median(np.abs(own))))
     fitted = fit(scene)
     effect = fitted.scene.fitted_effects()[-1]
-    if effect.constants and not (fitted.converged and _sensible(scene, effect)):
+    if effect.constants and not (fitted.converged and sensible(scene, effect)):
         # The grid's constants are good enough when a refined one runs away.
         fitted = fit(scene, hypothesis_constants_held(scene))
         effect = fitted.scene.fitted_effects()[-1]
@@ -233,10 +233,15 @@ def hypothesis_constants_held(scene: Scene) -> np.ndarray:
     return active
 
 
-def _sensible(scene: Scene, effect: Effect) -> bool:
-    """Whether refined constants stayed positive and within reach of the recording."""
+def sensible(scene: Scene, effect: Effect) -> bool:
+    """Whether refined constants stayed positive and within reach of the recording.
+
+    What settles faster than epochs follow each other is a step, and can't be told from it.
+    """
     time = np.asarray(scene.network.channels.epoch_time)
     span = float(np.ptp(time)) or 1.0
+    if effect.form == "settling" and effect.constants[1] < np.median(np.diff(time)):
+        return False
     for constant, value in zip(FORMS[effect.form].constants, effect.constants, strict=True):
         if not np.isfinite(value) or value <= 0.0:
             return False
