@@ -72,7 +72,7 @@ def test_entry_is_well_formed(entry):
     assert 0.0 < entry.plausible[0] < entry.plausible[1]
     assert entry.rows and all(1 <= row <= 98 for row in entry.rows)
     assert list(entry.rows) == sorted(set(entry.rows))
-    assert entry.entity in ("camera", "station", "target", "face", "mark", "rangefinder")
+    assert entry.entity in ("camera", "station", "target", "view", "face", "mark", "rangefinder")
     assert set(entry.drivers) <= {"constant", "time", "power-on", "quantity", "neighbour"} | KINDS
     assert set(entry.forms) <= set(FORMS)
     assert ("constant" in entry.drivers) == ("constant" in entry.forms)
@@ -244,7 +244,8 @@ def test_entry_names_a_hypothesis(entry):
     hypothesis = first_names()[entry.id]
     assert hypothesis.effect(()).name == entry.physics
     assert hypothesis.group.entity == entry.entity
-    kinds = {"mark": {"target", "point"}, "face": {"camera", "target"}}
+    view = {"camera", "target"}
+    kinds = {"mark": {"target", "point"}, "face": view, "view": view}
     assert set(hypothesis.scope.as_dict()) == kinds.get(entry.entity, {entry.entity})
 
 

@@ -140,7 +140,8 @@ def _asked_of_names(scene: Scene, courses: list[Course]) -> dict[str, int]:
         if bodies
     }
     if model.targets:
-        one |= {"face": one["target"], "mark": one["target"]}
+        view = Scope(camera=one["camera"].camera, target=one["target"].target)
+        one |= {"face": one["target"], "mark": one["target"], "view": view}
     distinct = {(course.driver, course.form): course for course in courses}
     kinds = {
         (kind, *named): kinds_in_scope(driver_kind(scene, named[0]), named[0], scope, scene)
@@ -160,7 +161,8 @@ def _family(scene: Scene, groups, courses, scopes, named: dict[str, int]) -> Fam
     driven = [driver_kind(scene, course.driver) for course in courses]
     distinct = set(zip(driven, ((c.driver, c.form) for c in courses), strict=True))
     asked = Counter(kind for kind, _ in distinct)
-    group_scope = np.array([[_has(scope, group) for scope in scopes] for group in groups])
+    faces = _faces(scene)
+    group_scope = np.array([[_has(scope, group, faces) for scope in scopes] for group in groups])
     course_scope = np.array([[_follows(scene, s, course) for s in scopes] for course in courses])
     valid = group_scope[:, None, :] & course_scope[None]
     # What nothing in this recording has (a rangefinder, say) is not computed either.
@@ -177,11 +179,12 @@ def _family(scene: Scene, groups, courses, scopes, named: dict[str, int]) -> Fam
     )
 
 
-def _has(scope: Scope, group: Group) -> bool:
+def _has(scope: Scope, group: Group, faces: set[Scope]) -> bool:
     """Whether the bodies of a scope have a group; a mark, which has its own, is in that of all."""
     if group.mark is not None:
         return scope == Scope()
-    return _kind(scope) == group.entity and (not group.target or scope.target == (group.target,))
+    alike = scope in faces if group.entity == "face" else _kind(scope) == group.entity
+    return alike and (not group.target or scope.target == (group.target,))
 
 
 def _follows(scene: Scene, scope: Scope, course: Course) -> bool:
@@ -235,7 +238,7 @@ def _of_size(groups: list[Group], n_terms: int) -> list[Group]:
 
 def _kind(scope: Scope) -> str:
     if scope.camera and scope.target:
-        return "face"
+        return "view"
     return next(iter(scope.as_dict()), "all")
 
 
@@ -252,19 +255,24 @@ def _scopes(scene: Scene) -> list[Scope]:
         scopes += [Scope(**{kind: (name,)}) for name in names]
         if len(names) > 1:
             scopes.append(Scope(**{kind: names}))
-    return scopes + _faces(scene)
+    return scopes + _views(scene)
 
 
-def _faces(scene: Scene) -> list[Scope]:
-    """Targets as single cameras see them, where cameras of several stations see them."""
-    model, obs = scene.model, scene.recording.observations
+def _views(scene: Scene) -> list[Scope]:
+    """Targets as single cameras see them."""
+    cameras, targets = scene.model.cameras, scene.model.targets
+    obs = scene.recording.observations
     seen = np.unique(np.stack([obs.target, obs.camera], axis=1), axis=0)
-    found = []
-    for t, target in enumerate(model.targets):
-        seers = [model.cameras[c] for c in seen[seen[:, 0] == t, 1]]
-        if len({camera.station for camera in seers}) > 1:
-            found += [Scope(camera=(camera.name,), target=(target.name,)) for camera in seers]
-    return found
+    return [Scope(camera=(cameras[c].name,), target=(targets[t].name,)) for t, c in seen]
+
+
+def _faces(scene: Scene) -> set[Scope]:
+    """Views of targets that cameras of several stations see."""
+    station = {camera.name: camera.station for camera in scene.model.cameras}
+    views = _views(scene)
+    seers = {(view.target, station[view.camera[0]]) for view in views}
+    count = Counter(target for target, _ in seers)
+    return {view for view in views if count[view.target] > 1}
 
 
 def _free_forms(scene: Scene, constant: list[Course]):
@@ -298,4 +306,4 @@ def _of_each_mark(scene: Scene, courses: list[Course], kinds: dict[str, tuple[st
                 if "points" not in target.free:
                     marks = range(int(first), int(first) + len(target.points))
                     own = each("mark", *ports, numbers=marks)
-                    yield [Group(own, "target", target=target.name)], known
+                    yield [Group(own, entry.entity, target=target.name)], known

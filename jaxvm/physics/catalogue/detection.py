@@ -60,7 +60,7 @@ DETECTION: tuple[Entry, ...] = (
     ),
     Entry(
         "dark-current", "dark current draws the dim marks of a target", (70,),
-        _SHIFT, ("temperature", "neighbour"), ("linear", "quadratic", "doubling"), "target",
+        _SHIFT, ("temperature", "neighbour"), ("linear", "quadratic", "doubling"), "view",
         (1e-5, 1e-1), "motion of the target", "cool the sensor; brighter marks",
         "Dark current doubles with every few kelvin and draws the measured centres of dim marks. "
         "The marks of a badly lit target shift together as the sensor warms.",
@@ -68,7 +68,7 @@ DETECTION: tuple[Entry, ...] = (
     Entry(
         "dark-current-of-marks", "dark current draws each mark by its dimness", (70,),
         (each("mark", "sensor.cx", "sensor.cy"),), ("temperature", "neighbour"), ("doubling",),
-        "target",
+        "view",
         (1e-4, 1.0), "displaced marks", "cool the sensor; brighter marks, all alike",
         "Dark current doubles with every few kelvin and draws the measured centres of dim marks. "
         "Marks that are not equally bright shift unequally, and faster and faster as it warms.",

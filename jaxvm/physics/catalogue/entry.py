@@ -22,8 +22,8 @@ class Entry:
             channel (`jaxvm.physics.drivers.CHANNEL_UNITS`: "temperature", ...), or "quantity", any
             recorded channel.
         forms: forms that the course may take, with any of the drivers.
-        entity: what has it: "camera", "station", "target", "face" (a target as one camera sees
-            it), "mark" or "rangefinder".
+        entity: what has it: "camera", "station", "target", "view" (a target as one camera sees
+            it), "face" (the same, of targets that several stations see), "mark" or "rangefinder".
         plausible: smallest and largest size that is met in practice, in the unit of the first port
             (per unit of the driver where it has one).
         mistaken_for: what looks alike.
