@@ -60,7 +60,7 @@ def test_identifiers_are_unique_and_many():
     assert len(BY_ID) == len(CATALOGUE) >= 65
 
 
-MIXED = {"aspect", "radial-beyond-model", "sensor-tilt"}
+MIXED = {"aspect", "radial-beyond-model", "sensor-tilt", "window-off-centre"}
 """Entries whose ports have several units."""
 
 

@@ -24,7 +24,7 @@ CURVED = (
     ("lens.k1",),
     ("target.scale",),
     ("target.bow_x", "target.bow_y"),
-    ("medium.bend_u", "medium.bend_v"),
+    ("medium.layers_x", "medium.layers_y", "medium.layers_up"),
     ("clock.offset",),
     ("range.offset",),
 )

@@ -42,8 +42,9 @@ _PATTERNS: tuple[tuple[str, str, tuple[float, ...]], ...] = (
 _TWICE = {("target.point_z", "target_x", "square"), ("target.point_z", "target_y", "square")}
 """Patterns that are ports by another name: these are `target.bow_x` and `bow_y`."""
 
-_AS_NAMED = ("target.disc", "medium.wedge_x", "medium.wedge_y")
-"""Ports that follow nothing: the size of marks stays, and a wedge is there or is not."""
+_DOME = ("medium.dome_x", "medium.dome_y", "medium.dome_z")
+_AS_NAMED = ("target.disc", "medium.wedge_x", "medium.wedge_y", *_DOME)
+"""Ports that follow nothing: the size of marks stays, a window is there or is not."""
 
 _PATTERNED_PORTS = ("detect.u", "detect.v", "sensor.focal", "target.point_z")
 
@@ -67,8 +68,9 @@ def every_port() -> list[Group]:
 
 def single_groups() -> list[Group]:
     """Each port alone that means something without a pattern and without a name."""
-    # A detector that measures too far everywhere is a principal point that moved.
-    other = ("detect.u", "detect.v", *_AS_NAMED)
+    # A detector that measures too far everywhere is a principal point that moved, and what bends
+    # rays for long is layered, alike for all cameras.
+    other = ("detect.u", "detect.v", "medium.bend_u", "medium.bend_v", *_AS_NAMED)
     return [group for group in every_port() if group.terms[0].port not in other]
 
 
@@ -107,5 +109,5 @@ def is_special(group: Group) -> bool:
 def entity_of(port: str) -> str:
     """Kind of entity that has a port."""
     # A window belongs to its camera, the air to all cameras of a station alike.
-    glass = port.startswith(("medium.window", "medium.wedge"))
+    glass = port.startswith(("medium.window", "medium.wedge", "medium.dome"))
     return "camera" if glass else _ENTITY_OF_STAGE[_STAGE[port]]

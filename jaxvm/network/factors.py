@@ -72,6 +72,7 @@ class PixelFactor(Factor):
     """
 
     family: LensFamily = eqx.field(static=True)
+    up: tuple[float, float, float] = eqx.field(static=True)
     real: Int[Array, ""]
     slots: Int[Array, "observations slots"]
     sigma: Float[Array, "observations 2"]
@@ -99,7 +100,7 @@ class PixelFactor(Factor):
         return (2, 2, self.family.n_coefficients, 6, 6, 6, 6, 3)
 
     def local(self, own, data, ports):
-        return predict_pixel(self.family, Sight(*own), data, ports) - data.pixel
+        return predict_pixel(self.family, Sight(*own), data, ports, self.up) - data.pixel
 
 
 class RangeFactor(Factor):

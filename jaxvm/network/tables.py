@@ -107,6 +107,7 @@ class Tables:
         obs = self.recording.observations
         lenses = [c.lens for c in self.model.cameras]
         tables, factors = [], []
+        up_x, up_y, up_z = map(float, self.model.up)
         for lens in dict.fromkeys(lenses):
             family = lens_family(lens)
             of_lens = np.array([name == lens for name in lenses])
@@ -140,6 +141,7 @@ class Tables:
             factors.append(
                 PixelFactor(
                     family=family,
+                    up=(up_x, up_y, up_z),
                     slots=jnp.asarray(np.concatenate(slots, axis=1)),
                     sigma=jnp.asarray(sigma),
                     weight=jnp.asarray(np.arange(len(chosen)) < real, float),

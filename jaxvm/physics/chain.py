@@ -6,9 +6,12 @@ Each stage takes the ports that act on it (`jaxvm.physics.ports`); with all port
 is the plain model. Only one observation is written here: tables of observations are `vmap`ped.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxvm.geometry.lenses import LensFamily
@@ -150,21 +153,43 @@ def _disturb(point: Float[Array, "3"], body: str, ports: PortValues) -> Float[Ar
 # --- medium -------------------------------------------------------------------------------------
 
 
-def refract(mark_cam: Float[Array, "3"], ports: PortValues) -> Float[Array, "3"]:
-    """Apparent mark in camera coordinates (m) through bending air and a plane window.
+def level_axes(up: tuple[float, float, float]) -> Float[np.ndarray, "3 3"]:
+    """Two level directions and the one upwards (columns, world axes).
 
-    Air with a constant gradient of its index bends rays to arcs of curvature k (rad per m of
-    path): the mark seems displaced by k L^2 / 2 across the line of sight (MATHEMATICS 1.9). A
-    plane-parallel plate of thickness d and index n, normal to the axis, brings the mark nearer by
-    d (1 - cos i / sqrt(n^2 - sin^2 i)) along the axis and turns no ray. A plate whose far face is
-    tilted by the wedge w turns rays by (sqrt(n^2 - sin^2 i) - cos i) w, in direction cosines across
-    the axis (Snell's law at the far face, to first order in w).
+    The first level one is as near as can be to the axis of the world that is least upright.
     """
-    if ports.plain:
-        return mark_cam
+    upwards = np.asarray(up, float) / np.linalg.norm(up)
+    nearest = np.eye(3)[np.argmin(np.abs(upwards))]
+    first = nearest - (nearest @ upwards) * upwards
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(upwards, first), upwards], axis=1)
+
+
+def layers(up: tuple[float, float, float], ports: PortValues) -> Float[Array, "3"]:
+    """Curvature (1/m, world axes) that layered air gives to rays, alike for all cameras."""
+    return jnp.asarray(level_axes(up)) @ jnp.stack(
+        [ports["medium.layers_x"], ports["medium.layers_y"], ports["medium.layers_up"]]
+    )
+
+
+def refract(
+    mark_cam: Float[Array, "3"], curvature: Float[Array, "3"], ports: PortValues
+) -> Float[Array, "3"]:
+    """Apparent mark in camera coordinates (m) through bending air and a window or a dome.
+
+    Air with a constant gradient of its index bends rays to arcs of a curvature k (rad per m of
+    path), given in camera axes: the mark seems displaced by k L^2 / 2 across the line of sight
+    (MATHEMATICS 1.9). A plane-parallel plate of thickness d and index n, normal to the axis, brings
+    the mark nearer by d (1 - cos i / sqrt(n^2 - sin^2 i)) along the axis and turns no ray. A plate
+    whose far face is tilted by the wedge w turns rays by (sqrt(n^2 - sin^2 i) - cos i) w, in
+    direction cosines across the axis (Snell's law at the far face, to first order in w). A dome of
+    radii R and R + t about a point at c from the pupil turns a ray of direction e by
+    k (c - (c e) e), k = (1 - 1/n) (1/R - 1/(R + t)) (Snell's law at both faces, to first order
+    in c); the port is k c.
+    """
     square = mark_cam @ mark_cam
-    bend = 0.5 * square * jnp.stack([ports["medium.bend_u"], ports["medium.bend_v"]])
-    bent = mark_cam + jnp.concatenate([bend, jnp.zeros(1)])
+    across_axis = jnp.stack([ports["medium.bend_u"], ports["medium.bend_v"], jnp.zeros(())])
+    bent = mark_cam + 0.5 * square * (curvature + across_axis)
     cos2 = bent[2] ** 2 / (bent @ bent)
     nearer = ports["medium.window"] * (1.0 - jnp.sqrt(cos2 / (WINDOW_INDEX**2 - (1.0 - cos2))))
     straight = bent.at[2].add(-nearer)
@@ -174,30 +199,9 @@ def refract(mark_cam: Float[Array, "3"], ports: PortValues) -> Float[Array, "3"]
     across = prism * jnp.stack([ports["medium.wedge_x"], ports["medium.wedge_y"]])
     # A direction keeps its length; nothing that is seen through a plane window is beside it.
     along = -(way[:2] @ across) / jnp.maximum(way[2], 0.05)
-    return straight + distance * jnp.concatenate([across, along[None]])
-
-
-def centre_of_disc(
-    mark_cam: Float[Array, "3"],
-    world_from_target: tuple[Pose, Pose],
-    world_from_camera: tuple[Pose, Pose],
-    ports: PortValues,
-) -> Float[Array, "3"]:
-    """Point (m, camera coordinates) whose image is the centre of the image of a circular mark.
-
-    The image of a disc of radius R is an ellipse, and its centre is not the image of the disc's
-    centre: with Z the depth, n the plate's normal and e the axis of the camera it is that of the
-    point off by -R^2 / Z (e - (e n) n). That is exact for a pinhole (the polar of the image's line
-    at infinity in the dual conic c c^T - R^2 (I - n n^T)), and on the axis f R^2 sin i cos i / Z^2
-    to first order (MATHEMATICS 1.9; Ahn, Warnecke and Kotowski 1999). What a lens distorts across
-    the mark itself is left out. Poses are given as (carrier, body on the carrier).
-    """
-    if ports.plain:
-        return mark_cam
-    (carrier, target), (station, camera) = world_from_target, world_from_camera
-    axis = jnp.array([0.0, 0.0, 1.0])
-    normal = camera.unrotate(station.unrotate(carrier.rotate(target.rotate(axis))))
-    return mark_cam - ports["target.disc"] / mark_cam[2] * (axis - normal[2] * normal)
+    beside = ports.axes("medium.dome")
+    turned = beside - (beside @ way) * way
+    return straight + distance * (jnp.concatenate([across, along[None]]) + turned)
 
 
 # --- lens, sensor, detection --------------------------------------------------------------------
@@ -232,6 +236,47 @@ def image(
     return family.distort(distortion, from_pupil, extra=extra)
 
 
+def image_of_disc(
+    image_of: Callable[[Float[Array, "3"]], Float[Array, "2"]],
+    mark_cam: Float[Array, "3"],
+    camera_from_target: Callable[[Float[Array, "3"]], Float[Array, "3"]],
+    ports: PortValues,
+) -> Float[Array, "2"]:
+    """Image point of a mark, or the centre of gravity of its image where it is a disc.
+
+    With p(a, b) the image of the plate's points about the mark and J the determinant of its
+    derivative F, the centroid of the image of a disc of radius R is, to the second order in R,
+
+        p + R^2/8 (p_aa + p_bb) + R^2/4 F grad log |J|.
+
+    For a pinhole that is the centre of the ellipse, on the axis f R^2 sin i cos i / Z^2 off the
+    image of the disc's centre (MATHEMATICS 1.9; Ahn, Warnecke and Kotowski 1999); it holds for what
+    a lens distorts and a window refracts across the mark as well.
+
+    Args:
+        image_of: image of a point in camera coordinates (m).
+        mark_cam: centre of the mark in camera coordinates (m).
+        camera_from_target: turns a direction of the target.
+    """
+    along = [camera_from_target(jnp.array(axis)) for axis in ([1.0, 0.0, 0.0], [0.0, 1.0, 0.0])]
+    plate = jnp.stack(along, axis=1)
+
+    def image_at(arm):
+        point = image_of(mark_cam + plate @ arm)
+        return point, point
+
+    def slope(arm):
+        first, point = jax.jacfwd(image_at, has_aux=True)(arm)
+        return first, (first, point)
+
+    second, (first, point) = jax.jacfwd(slope, has_aux=True)(jnp.zeros(2))
+    (a, b), (c, d) = first
+    cofactors = jnp.array([[d, -c], [-b, a]])
+    turned = jnp.einsum("ij,ijk->k", cofactors, second) / (a * d - b * c)
+    off = 0.5 * jnp.trace(second, axis1=1, axis2=2) + first @ turned
+    return point + 0.25 * ports["target.disc"] * off
+
+
 def expose(
     focal: Float[Array, "2"],
     centre: Float[Array, "2"],
@@ -258,8 +303,9 @@ def predict_pixel(
     sight: Sight,
     circumstances: Circumstances,
     ports: PortValues,
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0),
 ) -> Float[Array, "2"]:
-    """Predicted pixel (px) of one observation: the whole chain."""
+    """Predicted pixel (px) of one observation: the whole chain. `up` is a world direction."""
     at = circumstances
     target = mark(sight.point, at.target_centre, at.target_half_size, ports)
     delay = exposure_delay(at.pixel, at.image_height, ports)
@@ -267,11 +313,22 @@ def predict_pixel(
     world = place(carrier, own, target, delay, at.velocity, ports)
     station, mounted = map(pose_from_vector, (sight.world_from_station, sight.station_from_camera))
     camera = look(station, mounted, world, ports)
-    centre = centre_of_disc(camera, (carrier, own), (station, mounted), ports)
-    apparent = refract(centre, ports)
-    return expose(
-        sight.focal, sight.centre, image(family, sight.distortion, apparent, ports), ports
+
+    if ports.plain:
+        image_point = image(family, sight.distortion, camera, ports)
+        return expose(sight.focal, sight.centre, image_point, ports)
+
+    def camera_from_world(direction):
+        return mounted.unrotate(station.unrotate(direction))
+
+    curvature = camera_from_world(layers(up, ports))
+    image_point = image_of_disc(
+        lambda point: image(family, sight.distortion, refract(point, curvature, ports), ports),
+        camera,
+        lambda direction: camera_from_world(carrier.rotate(own.rotate(direction))),
+        ports,
     )
+    return expose(sight.focal, sight.centre, image_point, ports)
 
 
 # --- rangefinder --------------------------------------------------------------------------------

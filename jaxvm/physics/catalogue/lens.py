@@ -6,6 +6,12 @@ from jaxvm.physics.effects import Term
 _FOCAL, _RADIAL = (plain("sensor.focal"),), (plain("lens.k1"),)
 _DECENTRING = pair("lens.p1", "lens.p2")
 _INTRINSICS = plain("sensor.focal", "sensor.cx", "sensor.cy")
+_DOME = (
+    plain("medium.dome_x", "medium.dome_y", "medium.dome_z"),
+    plain("medium.dome_x", "medium.dome_y"),
+    *_DECENTRING,
+    _INTRINSICS,
+)
 
 
 def _rings(count: int) -> Terms:
@@ -190,7 +196,7 @@ LENS: tuple[Entry, ...] = (
     ),
     Entry(
         "window-off-centre", "a dome or a wedged window stands off the axis", (21,),
-        (*_DECENTRING, _INTRINSICS), ALWAYS, ALWAYS, "camera",
+        _DOME, ALWAYS, ALWAYS, "camera",
         (1e-6, 1e-2), "decentring of the lens", "take the window away, or turn it",
         "The camera does not sit in the middle of its dome, or its window is a wedge. The image is "
         "bent to one side, like that of a lens whose elements do not share one axis.",

@@ -2,16 +2,20 @@
 
 from jaxvm.physics.catalogue.entry import ALWAYS, CHANGING, THERMAL, Entry, each, pair, plain
 from jaxvm.physics.catalogue.maps import image_map
+from jaxvm.physics.effects import Term
 
 _AIR = ("constant", "gradient", "temperature", "irradiance")
 _AIR_FORMS = ("constant", "linear", "proportional", "lag", "lag with state")
+_LAYERS = (Term("medium.layers_up"), Term("medium.layers_up", "image_y", "linear"))
+"""Warm air over the ground: rays that pass lower bend more."""
+
 _OFF_CENTRE = (plain("sensor.focal"), plain("sensor.focal", "sensor.cx", "sensor.cy"))
 """A weak lens, on the axis of the camera or beside it."""
 
 MEDIUM: tuple[Entry, ...] = (
     Entry(
         "air-bending", "the air bends the rays", (16,),
-        (plain("medium.bend_v", "medium.bend_u"), plain("medium.bend_v")),
+        (_LAYERS, plain("medium.layers_up")),
         _AIR, _AIR_FORMS, "station",
         (1e-10, 1e-5), "turn of the mount", "watch targets at several ranges",
         "A gradient of temperature makes a gradient of the refractive index, and rays become "
@@ -19,7 +23,7 @@ MEDIUM: tuple[Entry, ...] = (
     ),
     Entry(
         "air-bending-lateral", "the air bends the rays sideways", (17,),
-        (plain("medium.bend_u"),), _AIR, _AIR_FORMS, "station",
+        pair("medium.layers_x", "medium.layers_y"), _AIR, _AIR_FORMS, "station",
         (1e-10, 1e-5), "yaw of the mount", "watch targets at several ranges",
         "A warm wall, a heater or a sunlit side makes the air warmer on one side of the path. "
         "Rays bend away from the warm side, by the square of the distance.",
