@@ -7,11 +7,12 @@ import pytest
 from networks import board_recording
 
 from jaxvm.discover.accept import STRONG
+from jaxvm.discover.constants import sensible
 from jaxvm.discover.courses import Course
 from jaxvm.discover.diagnose import _plain_fit
 from jaxvm.discover.groups import Group
 from jaxvm.discover.hypotheses import Hypothesis
-from jaxvm.discover.select import best_named, identity, log_prior, refit, sensible
+from jaxvm.discover.select import best_named, identity, log_prior, refit
 from jaxvm.network.residual import predict_pixels
 from jaxvm.physics.catalogue import entries_for
 from jaxvm.physics.catalogue.entry import each

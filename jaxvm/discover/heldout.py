@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from jaxvm.discover.constants import constants_held, run_away
 from jaxvm.network.scene import Scene
 from jaxvm.solve.adjust import Adjustment, adjust, reference_sigma
 
@@ -84,16 +85,25 @@ class Split:
         return sum(int(w.sum()) * 2 for w in self.weights)
 
     def fit(self, scene: Scene, check: bool = False, wanted: float = np.inf) -> Adjustment:
-        """Adjustment of a scene to the fitted epochs, given up where it won't get to a cost."""
-        return adjust(
-            scene,
-            weights=self.weights,
-            range_weights=self.range_weights,
-            rtol=1e-9,
-            damping=1e-6 if scene.effects else 1e-3,
-            wanted=wanted,
-            check=check,
-        )
+        """Adjustment of a scene to the fitted epochs, given up where it won't get to a cost.
+
+        Nonlinear constants that run away are held where they began.
+        """
+
+        def fit(active: np.ndarray | None) -> Adjustment:
+            return adjust(
+                scene,
+                weights=self.weights,
+                range_weights=self.range_weights,
+                active=active,
+                rtol=1e-9,
+                damping=1e-6 if scene.effects else 1e-3,
+                wanted=wanted,
+                check=check,
+            )
+
+        fitted = fit(None)
+        return fit(constants_held(scene)) if run_away(scene, fitted.scene) else fitted
 
     def evaluate(self, scene: Scene) -> HeldOut:
         """Errors of a fitted scene on the epochs set aside."""

@@ -137,7 +137,8 @@ def information_of(
     carried = np.einsum("ebw,ew->be", part.by_epoch**2, of_epoch, optimize=True)
     carried = carried.reshape(b, n_bases, -1).sum(axis=1)
     total = carried.sum(axis=1)
-    n_carrying = total**2 / np.maximum(np.sum(carried**2, axis=1), 1e-300)
+    # By the size of the effect, not its square: a near image does not make others count less.
+    n_carrying = np.sqrt(carried).sum(axis=1) ** 2 / np.maximum(total, 1e-300)
     fewest = min(_FEWEST_EPOCHS, 0.5 * len(place.epoch))
     sound = valid & (seen > 1e-6) & (total > 0.0) & (n_carrying >= fewest)
     return Information(whitener * unit[:, None, :], seen, sound)

@@ -9,9 +9,10 @@ from typing import Protocol
 
 import numpy as np
 
+from jaxvm.discover.constants import sensible
 from jaxvm.discover.diagnosis import Finding
 from jaxvm.discover.hypotheses import Hypothesis
-from jaxvm.discover.select import price, price_of_columns, sensible
+from jaxvm.discover.select import price, price_of_columns
 from jaxvm.network.scene import Scene
 from jaxvm.solve.adjust import Adjustment
 from jaxvm.solve.covariance import wald_drops

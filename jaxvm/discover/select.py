@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from jaxvm.discover.constants import constants_held, sensible
 from jaxvm.discover.heldout import Split
 from jaxvm.discover.hypotheses import FREE, Hypothesis
 from jaxvm.discover.ranking import Ranking, top
@@ -205,7 +206,7 @@ def refit(base: Adjustment, hypothesis: Hypothesis, amplitudes, split: Split) ->
     effect = fitted.scene.fitted_effects()[-1]
     if effect.constants and not (fitted.converged and sensible(scene, effect)):
         # The grid's constants are good enough when a refined one runs away.
-        fitted = fit(scene, hypothesis_constants_held(scene))
+        fitted = fit(scene, constants_held(scene))
         effect = fitted.scene.fitted_effects()[-1]
     if fitted.failed:
         return None
@@ -223,31 +224,6 @@ def _with_spread(scene: Scene, size: float) -> Scene:
     """The scene with the prior of the last effect's amplitudes as wide as their size says."""
     *others, last = scene.effects
     return scene.with_effects((*others, replace(last, spread=_WIDE * size)), scene.room)
-
-
-def hypothesis_constants_held(scene: Scene) -> np.ndarray:
-    """Active unknowns of a scene with all nonlinear constants held."""
-    active = scene.unknowns.active.copy()
-    columns = scene.unknowns.column[scene.network.layout.all("constant")]
-    active[columns[columns < scene.unknowns.n]] = False
-    return active
-
-
-def sensible(scene: Scene, effect: Effect) -> bool:
-    """Whether refined constants stayed positive and within reach of the recording.
-
-    What settles faster than epochs follow each other is a step, and can't be told from it.
-    """
-    time = np.asarray(scene.network.channels.epoch_time)
-    span = float(np.ptp(time)) or 1.0
-    if effect.form == "settling" and effect.constants[1] < np.median(np.diff(time)):
-        return False
-    for constant, value in zip(FORMS[effect.form].constants, effect.constants, strict=True):
-        if not np.isfinite(value) or value <= 0.0:
-            return False
-        if constant.unit == "s" and value > 3.0 * span:
-            return False
-    return True
 
 
 def stacked(adjustment: Adjustment) -> np.ndarray:

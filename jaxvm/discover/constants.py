@@ -1,0 +1,38 @@
+"""Nonlinear constants of effects (time constants, instants, ...): sensible ones, and held ones."""
+
+import numpy as np
+
+from jaxvm.network.scene import Scene
+from jaxvm.physics.effects import Effect
+from jaxvm.physics.forms import FORMS
+
+
+def constants_held(scene: Scene) -> np.ndarray:
+    """Active unknowns of a scene with all nonlinear constants held."""
+    active = scene.unknowns.active.copy()
+    columns = scene.unknowns.column[scene.network.layout.all("constant")]
+    active[columns[columns < scene.unknowns.n]] = False
+    return active
+
+
+def run_away(before: Scene, after: Scene) -> bool:
+    """Whether constants of an effect that were sensible before a fit no longer are after it."""
+    pairs = zip(before.effects, after.fitted_effects(), strict=True)
+    return any(sensible(before, own) and not sensible(after, fitted) for own, fitted in pairs)
+
+
+def sensible(scene: Scene, effect: Effect) -> bool:
+    """Whether refined constants stayed positive and within reach of the recording.
+
+    What settles faster than epochs follow each other is a step, and can't be told from it.
+    """
+    time = np.asarray(scene.network.channels.epoch_time)
+    span = float(np.ptp(time)) or 1.0
+    if effect.form == "settling" and effect.constants[1] < np.median(np.diff(time)):
+        return False
+    for constant, value in zip(FORMS[effect.form].constants, effect.constants, strict=True):
+        if not np.isfinite(value) or value <= 0.0:
+            return False
+        if constant.unit == "s" and value > 3.0 * span:
+            return False
+    return True
