@@ -12,8 +12,10 @@ import numpy as np
 from jaxvm.discover.constants import sensible
 from jaxvm.discover.diagnosis import Finding
 from jaxvm.discover.hypotheses import Hypothesis
+from jaxvm.discover.rivals import Rival
 from jaxvm.discover.select import price, price_of_columns
 from jaxvm.network.scene import Scene
+from jaxvm.physics.effects import room_for
 from jaxvm.solve.adjust import Adjustment
 from jaxvm.solve.covariance import wald_drops
 
@@ -27,6 +29,9 @@ class Fit(Protocol):
 _MOST_TRIED = 12
 """Alternatives that are fitted at most, those of the first findings first: what was named while
 most was missing is the likeliest to be wrong."""
+
+_LIKELIER = 2.0
+"""Odds from which a double leads in place of what fits best; less is within what odds are worth."""
 
 
 def prune(
@@ -95,6 +100,38 @@ def _better(
     if not tried.converged or gained <= cost:
         return current, findings, k
     return tried, new, k - sum(j < k for j in needless)
+
+
+def likelier(
+    current: Adjustment, findings: list[Finding], k: int, fit: Fit
+) -> tuple[Adjustment, list[Finding]]:
+    """Findings whose k-th has the name of a double that is clearly likelier than what fits best.
+
+    What fits best by a little may be the less plausible one by far.
+    """
+    finding, scene = findings[k], current.scene
+    named = [rival for rival in finding.rivals if rival.hypothesis.entries]
+    best = max(named, key=lambda rival: rival.weight, default=None)
+    if best is None or best.weight < _LIKELIER * finding.weight:
+        return current, findings
+    effects = list(scene.fitted_effects())
+    effects[len(effects) - len(findings) + k] = best.hypothesis.effect(
+        np.zeros(best.hypothesis.n_columns)
+    )
+    tried = fit(scene.with_effects(tuple(effects), room_for(tuple(effects), scene.room)))
+    if not tried.converged:
+        return current, findings
+    before = Rival(finding.hypothesis, 0.0, finding.weight, finding.drivers)
+    others = [rival for rival in (*finding.rivals, before) if rival is not best]
+    leading = replace(
+        finding,
+        hypothesis=best.hypothesis,
+        stds=(),
+        weight=best.weight,
+        drivers=best.drivers,
+        rivals=tuple(sorted(others, key=lambda rival: -rival.weight)),
+    )
+    return tried, with_effects([*findings[:k], leading, *findings[k + 1 :]], tried)
 
 
 def with_effects(findings: list[Finding], fitted: Adjustment) -> list[Finding]:

@@ -13,7 +13,7 @@ from jaxvm.discover.hypotheses import FREE, Hypothesis
 from jaxvm.discover.noise import Correlation, Met, met, random_signs
 from jaxvm.discover.pairs import better_pair, other_beginnings, worth_a_second_thought
 from jaxvm.discover.ranking import Ranking, begun_slowly, spread_of_constant, surprise
-from jaxvm.discover.revise import lost_without, prune, rename, with_effects
+from jaxvm.discover.revise import likelier, lost_without, prune, rename, with_effects
 from jaxvm.discover.rivals import rivals
 from jaxvm.discover.scatter import ALIKE, likeness, of_each_image
 from jaxvm.discover.score import ScoreTests
@@ -355,6 +355,7 @@ class Search:
                 ]
         elif any(finding.noise > _WIDER for finding in self.findings):
             self.findings = [self._weighed_again(0)]
+        self._lead_with_the_likeliest()
         if [finding.hypothesis for finding in self.findings] != names:
             self.current, self.heldout = parts.proven(self.current)
             deviations = effect_deviations(self.current)[self.given :]
@@ -370,8 +371,18 @@ class Search:
         self.findings = [self._doubted(finding) for finding in self.findings]
 
     def _rename(self) -> None:
-        """Better names beside all the others, where held-out epochs don't speak against them."""
-        current, findings = rename(self.current, self.findings, self.parts.n, self.parts.fit)
+        """Better names beside all the others."""
+        self._take_over(*rename(self.current, self.findings, self.parts.n, self.parts.fit))
+
+    def _lead_with_the_likeliest(self) -> None:
+        """Doubles that are likelier than what fits best lead, if held-out epochs say no other."""
+        for k in range(len(self.findings)):
+            current, findings = likelier(self.current, self.findings, k, self.parts.fit)
+            if findings is not self.findings:
+                self._take_over(current, findings)
+
+    def _take_over(self, current: Adjustment, findings: list[Finding]) -> None:
+        """Other names, where held-out epochs don't speak against them."""
         shown = self.parts.evaluate(current.scene)
         if shown.rms_px <= _WORSE * self.heldout.rms_px:
             self.current, self.findings = current, findings
