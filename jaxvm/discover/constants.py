@@ -1,7 +1,11 @@
 """Nonlinear constants of effects (time constants, instants, ...): sensible ones, and held ones."""
 
+from collections.abc import Iterator
+from dataclasses import replace
+
 import numpy as np
 
+from jaxvm.discover.courses import at_epochs
 from jaxvm.network.scene import Scene
 from jaxvm.physics.effects import Effect
 from jaxvm.physics.forms import FORMS
@@ -36,3 +40,27 @@ def sensible(scene: Scene, effect: Effect) -> bool:
         if constant.unit == "s" and value > 3.0 * span:
             return False
     return True
+
+
+def other_instants(scene: Scene, fitted: np.ndarray) -> Iterator[Scene]:
+    """Scenes with one step on the other side of an epoch beside it that was not fitted.
+
+    The fitted epochs leave open on which side of the step such an epoch lies.
+
+    Args:
+        scene: a fitted scene.
+        fitted: for each epoch whether it was fitted.
+    """
+    for k, effect in enumerate(scene.effects):
+        if effect.form != "step":
+            continue
+        at = at_epochs(effect.driver, scene.network.channels)
+        order = np.argsort(at)
+        at, sure = at[order], fitted[order]
+        first = int(np.searchsorted(at, effect.constants[0]))
+        for beside, gap in ((first - 1, first - 1), (first, first + 1)):
+            if 0 < gap < len(at) and not sure[beside]:
+                effects = list(scene.fitted_effects())
+                instant = float(0.5 * (at[gap - 1] + at[gap]))
+                effects[k] = replace(effects[k], constants=(instant,))
+                yield scene.with_effects(tuple(effects), scene.room)

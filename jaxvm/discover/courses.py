@@ -124,7 +124,7 @@ def courses_of_marks(scene: Scene, courses: list[Course], n_marks: int) -> list[
 
 def _of_quantity(driver: str, channels: Channels, lags: list[float]) -> list[Course]:
     """A recorded quantity: followed at once or late, by its rate, or with a memory of its way."""
-    values = np.interp(channels.epoch_time, channels.time, _recorded(driver, channels))
+    values = at_epochs(driver, channels)
     width = float(np.ptp(values))
     if width == 0.0:
         return []
@@ -206,8 +206,8 @@ def _of_power_on(driver: str, channels: Channels, lags: list[float]) -> list[Cou
 def _of_time(driver: str, channels: Channels, lags: list[float]) -> list[Course]:
     """Time: trends, steps between epochs, ramps, a comb of periods, what settles after an event."""
     span = _span(channels)
-    since = np.unique(np.interp(channels.epoch_time, channels.time, _recorded(driver, channels)))
-    instants = (0.5 * (since[1:] + since[:-1]))[2:-2]
+    since = np.unique(at_epochs(driver, channels))
+    instants = gaps(driver, channels)
     if len(instants) > _MOST_INSTANTS:
         instants = instants[np.linspace(0, len(instants) - 1, _MOST_INSTANTS).astype(int)]
     periods = span / np.arange(1.0, min(span / (2.05 * _spacing(channels)), 34.0), 0.5)
@@ -224,6 +224,17 @@ def _of_time(driver: str, channels: Channels, lags: list[float]) -> list[Course]
             for tau in lags[2::2]
         ),
     ]
+
+
+def gaps(driver: str, channels: Channels) -> np.ndarray:
+    """Middles between epochs (s of the driver) where a step leaves some epochs on either side."""
+    since = np.unique(at_epochs(driver, channels))
+    return (0.5 * (since[1:] + since[:-1]))[2:-2]
+
+
+def at_epochs(driver: str, channels: Channels) -> np.ndarray:
+    """Values of a driver in all epochs."""
+    return np.asarray(np.interp(channels.epoch_time, channels.time, _recorded(driver, channels)))
 
 
 _OF_KIND = {

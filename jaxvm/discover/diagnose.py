@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from jaxvm.discover.advice import advise
+from jaxvm.discover.constants import other_instants
 from jaxvm.discover.diagnosis import Diagnosis, Finding, Quality
 from jaxvm.discover.gross import without_gross_errors
 from jaxvm.discover.heldout import (
@@ -158,19 +159,11 @@ def _with_best_instants(final: Adjustment, weights) -> Adjustment:
 
     The fitted epochs alone leave open on which side an epoch between two of them lies.
     """
-    time = np.asarray(final.scene.network.channels.epoch_time)
-    between = 0.5 * (time[1:] + time[:-1]) - time[0]
-    for k, effect in enumerate(final.scene.effects):
-        if effect.form != "step":
-            continue
-        place = int(np.argmin(np.abs(between - effect.constants[0])))
-        for other in {max(place - 1, 0), min(place + 1, len(between) - 1)} - {place}:
-            effects = list(final.scene.fitted_effects())
-            effects[k] = replace(effects[k], constants=(float(between[other]),))
-            scene = final.scene.with_effects(tuple(effects), final.scene.room)
-            tried = adjust(scene, weights=weights, rtol=1e-8, check=False)
-            if tried.cost < final.cost:
-                final = tried
+    everywhere = np.zeros(len(final.scene.recording.time), bool)
+    for scene in other_instants(final.scene, everywhere):
+        tried = adjust(scene, weights=weights, rtol=1e-8, check=False)
+        if tried.cost < final.cost:
+            final = tried
     return final
 
 

@@ -144,7 +144,7 @@ def spread_of_constant(ranking: Ranking, hypothesis: Hypothesis, scene: Scene) -
     The posterior over the grid, with a flat prior: weights exp(drop / 2). It is not less than what
     the step of the grid leaves open.
     """
-    for scores, g, own, s in _where(ranking, hypothesis, scene):
+    for scores, g, own, s in where(ranking, hypothesis, scene):
         at = np.array([scores.family.courses[k].constants[0] for k in own])
         drop = np.where(scores.valid[g, own, s], scores.drop[g, own, s], -np.inf)
         weight = np.exp(0.5 * (drop - drop.max()) / scores.variance)
@@ -164,13 +164,13 @@ def begun_slowly(ranking: Ranking, hypothesis: Hypothesis, scene: Scene) -> Hypo
         return None
     pause = float(np.median(np.diff(time)))
     slow = Course(course.driver, "settling", (max(course.constants[0] - 0.5 * pause, 0.0), pause))
-    for scores, g, own, s in _where(ranking, replace(hypothesis, course=slow), scene):
+    for scores, g, own, s in where(ranking, replace(hypothesis, course=slow), scene):
         return replace(member(scores.family, (g, own[0], s), scene), course=slow)
     return None
 
 
-def _where(ranking: Ranking, hypothesis: Hypothesis, scene: Scene):
-    """Scores, group, courses and scope of a hypothesis, whatever its constants."""
+def where(ranking: Ranking, hypothesis: Hypothesis, scene: Scene):
+    """Yields scores, group, courses and scope of a hypothesis, whatever its constants."""
     kind = hypothesis.course.driver, hypothesis.course.form
     for scores in ranking.scores:
         family = scores.family

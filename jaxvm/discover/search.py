@@ -10,6 +10,7 @@ from jaxvm.discover.detail import with_detail
 from jaxvm.discover.diagnosis import Finding
 from jaxvm.discover.heldout import HeldOut, Split, gain
 from jaxvm.discover.hypotheses import FREE, Hypothesis
+from jaxvm.discover.instants import best_instant, step_at_every_gap
 from jaxvm.discover.noise import Correlation, Met, met, random_signs
 from jaxvm.discover.pairs import better_pair, other_beginnings, worth_a_second_thought
 from jaxvm.discover.ranking import Ranking, begun_slowly, spread_of_constant, surprise
@@ -17,7 +18,7 @@ from jaxvm.discover.revise import likelier, lost_without, prune, rename, with_ef
 from jaxvm.discover.rivals import rivals
 from jaxvm.discover.scatter import ALIKE, likeness, of_each_image
 from jaxvm.discover.score import ScoreTests
-from jaxvm.discover.select import Candidate, identity, refit, shortlist, stacked
+from jaxvm.discover.select import Candidate, evidence, identity, refit, shortlist, stacked
 from jaxvm.discover.space import enumerate_hypotheses
 from jaxvm.discover.waves import strongest_wave
 from jaxvm.physics.forms import FORMS
@@ -84,6 +85,7 @@ class Search:
     _signs: np.ndarray = field(init=False)
     _hopeless: set = field(default_factory=set)
     _superfluous: set = field(default_factory=set)
+    _finer: dict[tuple, Ranking] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._signs = random_signs(len(self.parts.held), FLIPS, self.seed)
@@ -118,7 +120,7 @@ class Search:
             first = first or self.ranking
             if len(self.findings) == most:
                 break
-            leading = self._with_slow_beginnings(leading)
+            leading = self._with_slow_beginnings(self._at_their_instants(leading))
             accepted = self._accepted(leading, progress)
             if accepted is None:
                 # What no course explains may be a wave, or differ from image to image.
@@ -148,14 +150,29 @@ class Search:
             self.p_value = self._p_without(*foremost[0][::2])
         return foremost
 
+    def _at_their_instants(self, leading):
+        """The leading ones, with steps in the gap between epochs where they fit best."""
+        tests, n, found = self._tests, self.parts.n, []
+        self._finer.clear()
+        for item in leading:
+            hypothesis, variance = item[0], self.ranking.scores[0].variance
+            finer = step_at_every_gap(tests, self.ranking, hypothesis, variance)
+            best = best_instant(finer, hypothesis, tests) if finer else None
+            if finer and best:
+                refined, drop, amplitudes = best
+                self._finer[_said(refined)] = finer
+                item = refined, evidence(refined, drop, amplitudes, variance, n), amplitudes
+            found.append(item)
+        return sorted(found, key=lambda item: -item[1])
+
     def _with_slow_beginnings(self, leading):
         """The leading ones, and right after each step what settles from its moment on."""
         found = []
-        for hypothesis, evidence, amplitudes in leading:
-            found.append((hypothesis, evidence, amplitudes))
+        for hypothesis, own, amplitudes in leading:
+            found.append((hypothesis, own, amplitudes))
             slow = begun_slowly(self.ranking, hypothesis, self.current.scene)
             if slow is not None and len(found) <= _BEGINNINGS:
-                found.append((slow, evidence, amplitudes))
+                found.append((slow, own, amplitudes))
         return found
 
     def _accepted(self, leading, progress: Callable[[str], None]) -> Accepted | None:
@@ -300,7 +317,8 @@ class Search:
         form = FORMS[chosen.hypothesis.course.form]
         if not form.constants or form.constants[0].refined:
             return stds
-        spread = spread_of_constant(self.ranking, chosen.hypothesis, self.current.scene)
+        ranking = self._finer.get(_said(chosen.hypothesis), self.ranking)
+        spread = spread_of_constant(ranking, chosen.hypothesis, self.current.scene)
         return (*stds[: chosen.effect.n_columns], spread, *stds[chosen.effect.n_columns + 1 :])
 
     def _with_heir(self, former: list[Finding]) -> list[Finding]:
@@ -444,6 +462,11 @@ class Search:
         scene = self.current.scene
         self.current = self.parts.fit(scene.with_effects(effects, scene.room))
         self.findings = [self.findings[k] for k in kept]
+
+
+def _said(hypothesis: Hypothesis) -> tuple:
+    """What a hypothesis says, under any name."""
+    return hypothesis.group, hypothesis.course, hypothesis.scope
 
 
 def _alternatives(accepted: Accepted, leading) -> tuple[Hypothesis, ...]:
