@@ -159,10 +159,12 @@ def shortlist(
         for hypothesis, drop, amplitudes in top(ranking, scene, 400, columns)
     ]
     for hypothesis, own, amplitudes in sorted(weighed, key=lambda item: -item[1]):
-        # The same terms at the same place in another course: only if it is nearly as good.
+        # The same terms at the same place in another course: only if it is nearly as good; or a
+        # step, which is asked at few instants, and gains most by a better one.
         place = (hypothesis.group, hypothesis.scope)
         key = (identity(hypothesis), hypothesis.course.form)
-        if key in seen or seen.get(place, own) - own > CLEAR:
+        behind = hypothesis.course.form != "step" and seen.get(place, own) - own > CLEAR
+        if key in seen or behind:
             continue
         seen.setdefault(place, own)
         seen[key] = own
