@@ -38,6 +38,8 @@ def section(name: str, question: str, command: str) -> list[str]:
     if not tables:
         files = sorted(path.name for path in (HERE / name).glob("*.json"))
         lines += [f"Numbers: {', '.join(f'`{name}/{file}`' for file in files)}.", ""]
+    missed = HERE / name / "missed.md"
+    lines += [f"#{missed.read_text().rstrip()}", ""] if missed.exists() else []
     newest = [path for path in sorted((HERE / name).glob("*.png")) if _shown(name, path, tables)]
     lines += [f"![{path.stem}]({name}/{path.name})" for path in newest]
     return [*lines, ""] if newest else lines
