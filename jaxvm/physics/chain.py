@@ -236,13 +236,12 @@ def image(
     return family.distort(distortion, from_pupil, extra=extra)
 
 
-def image_of_disc(
+def off_centre_of_disc(
     image_of: Callable[[Float[Array, "3"]], Float[Array, "2"]],
     mark_cam: Float[Array, "3"],
-    camera_from_target: Callable[[Float[Array, "3"]], Float[Array, "3"]],
-    ports: PortValues,
+    plate: Float[Array, "3 2"],
 ) -> Float[Array, "2"]:
-    """Image point of a mark, or the centre of gravity of its image where it is a disc.
+    """By how much the centre of gravity of a disc's image is off, in units of R^2/4 (1/m^2).
 
     With p(a, b) the image of the plate's points about the mark and J the determinant of its
     derivative F, the centroid of the image of a disc of radius R is, to the second order in R,
@@ -256,25 +255,20 @@ def image_of_disc(
     Args:
         image_of: image of a point in camera coordinates (m).
         mark_cam: centre of the mark in camera coordinates (m).
-        camera_from_target: turns a direction of the target.
+        plate: two directions along the plate in camera coordinates (columns).
     """
-    along = [camera_from_target(jnp.array(axis)) for axis in ([1.0, 0.0, 0.0], [0.0, 1.0, 0.0])]
-    plate = jnp.stack(along, axis=1)
 
     def image_at(arm):
-        point = image_of(mark_cam + plate @ arm)
-        return point, point
+        return image_of(mark_cam + plate @ arm)
 
     def slope(arm):
-        first, point = jax.jacfwd(image_at, has_aux=True)(arm)
-        return first, (first, point)
+        first = jax.jacfwd(image_at)(arm)
+        return first, first
 
-    second, (first, point) = jax.jacfwd(slope, has_aux=True)(jnp.zeros(2))
-    (a, b), (c, d) = first
+    second, ((a, b), (c, d)) = jax.jacfwd(slope, has_aux=True)(jnp.zeros(2))
     cofactors = jnp.array([[d, -c], [-b, a]])
     turned = jnp.einsum("ij,ijk->k", cofactors, second) / (a * d - b * c)
-    off = 0.5 * jnp.trace(second, axis1=1, axis2=2) + first @ turned
-    return point + 0.25 * ports["target.disc"] * off
+    return 0.5 * jnp.trace(second, axis1=1, axis2=2) + jnp.array([[a, b], [c, d]]) @ turned
 
 
 def expose(
@@ -321,13 +315,16 @@ def predict_pixel(
     def camera_from_world(direction):
         return mounted.unrotate(station.unrotate(direction))
 
-    curvature = camera_from_world(layers(up, ports))
-    image_point = image_of_disc(
-        lambda point: image(family, sight.distortion, refract(point, curvature, ports), ports),
-        camera,
-        lambda direction: camera_from_world(carrier.rotate(own.rotate(direction))),
-        ports,
-    )
+    def image_of(point, distortion, curvature, ports):
+        return image(family, distortion, refract(point, curvature, ports), ports)
+
+    shown = sight.distortion, camera_from_world(layers(up, ports))
+    plate = jnp.stack([camera_from_world(carrier.rotate(own.rotate(a))) for a in jnp.eye(3)[:2]], 1)
+    # What the size of a mark does changes with poses and lenses by its square alone: third
+    # derivatives of the image would make every fit twice as dear.
+    still, middle, arms = jax.lax.stop_gradient((shown, camera, plate))
+    off = off_centre_of_disc(lambda p: image_of(p, *still, ports.held()), middle, arms)
+    image_point = image_of(camera, *shown, ports) + 0.25 * ports["target.disc"] * off
     return expose(sight.focal, sight.centre, image_point, ports)
 
 

@@ -157,6 +157,13 @@ class PortValues:
         if values is not None:
             self._values = [part[0] for part in jax.lax.split(values, (1,) * N_PORTS)]
 
+    def held(self) -> "PortValues":
+        """The same values, which are not differentiated."""
+        held = PortValues()
+        if not self.plain:
+            held.plain, held._values = False, jax.lax.stop_gradient(self._values)
+        return held
+
     def __getitem__(self, name: str) -> Float[Array, ""] | float:
         """Value of one port, in its unit."""
         return 0.0 if self.plain else self._values[PORT_INDEX[name]]
