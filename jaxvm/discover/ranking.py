@@ -1,12 +1,11 @@
 """What the scores say: which hypotheses lead, and how likely noise alone gives as much."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 from scipy.special import gammaln
 
-from jaxvm.discover.courses import Course
 from jaxvm.discover.hypotheses import Family, Hypothesis
 from jaxvm.discover.space import member
 from jaxvm.network.scene import Scene
@@ -152,21 +151,6 @@ def spread_of_constant(ranking: Ranking, hypothesis: Hypothesis, scene: Scene) -
         step = float(np.median(np.diff(np.unique(at)))) if len(at) > 1 else 0.0
         return float(np.hypot(np.sqrt(weight @ (at - mean) ** 2 / weight.sum()), step / 3.5))
     return 0.0
-
-
-def begun_slowly(ranking: Ranking, hypothesis: Hypothesis, scene: Scene) -> Hypothesis | None:
-    """What settles from the moment of a step on, in the same terms at the same place, if asked.
-
-    It contains the step, but the grid of its two constants is too coarse to show it.
-    """
-    course, time = hypothesis.course, np.asarray(scene.network.channels.epoch_time)
-    if course.form != "step" or len(time) < 2:
-        return None
-    pause = float(np.median(np.diff(time)))
-    slow = Course(course.driver, "settling", (max(course.constants[0] - 0.5 * pause, 0.0), pause))
-    for scores, g, own, s in where(ranking, replace(hypothesis, course=slow), scene):
-        return replace(member(scores.family, (g, own[0], s), scene), course=slow)
-    return None
 
 
 def where(ranking: Ranking, hypothesis: Hypothesis, scene: Scene):

@@ -10,15 +10,15 @@ from jaxvm.discover.detail import with_detail
 from jaxvm.discover.diagnosis import Finding
 from jaxvm.discover.heldout import HeldOut, Split, gain
 from jaxvm.discover.hypotheses import FREE, Hypothesis
-from jaxvm.discover.instants import best_instant, step_at_every_gap
+from jaxvm.discover.instants import at_their_instants, said, with_slow_beginnings
 from jaxvm.discover.noise import Correlation, Met, met, random_signs
 from jaxvm.discover.pairs import better_pair, other_beginnings, worth_a_second_thought
-from jaxvm.discover.ranking import Ranking, begun_slowly, spread_of_constant, surprise
+from jaxvm.discover.ranking import Ranking, spread_of_constant, surprise
 from jaxvm.discover.revise import likelier, lost_without, prune, rename, with_effects
 from jaxvm.discover.rivals import rivals
 from jaxvm.discover.scatter import ALIKE, likeness, of_each_image
 from jaxvm.discover.score import ScoreTests
-from jaxvm.discover.select import Candidate, evidence, identity, refit, shortlist, stacked
+from jaxvm.discover.select import Candidate, identity, refit, shortlist, stacked
 from jaxvm.discover.space import enumerate_hypotheses
 from jaxvm.discover.waves import strongest_wave
 from jaxvm.physics.forms import FORMS
@@ -43,9 +43,6 @@ _TRIED_AGAIN, _HOPEFUL = 6, 0.75
 
 _WORSE = 1.01
 """Rise of the held-out RMS that other names may bring: what differs less is noise."""
-
-_BEGINNINGS = 4
-"""Leading hypotheses among which a step is tried as a slow beginning, too."""
 
 _WIDER = 1.2
 """Inflation by noise from which the rivals of a finding are weighed again: more of them stay."""
@@ -120,7 +117,10 @@ class Search:
             first = first or self.ranking
             if len(self.findings) == most:
                 break
-            leading = self._with_slow_beginnings(self._at_their_instants(leading))
+            leading, self._finer = at_their_instants(
+                leading, self._tests, self.ranking, self.parts.n
+            )
+            leading = with_slow_beginnings(leading, self.ranking, self.current.scene)
             accepted = self._accepted(leading, progress)
             if accepted is None:
                 # What no course explains may be a wave, or differ from image to image.
@@ -149,31 +149,6 @@ class Search:
         if self.p_value > self.alpha and foremost:
             self.p_value = self._p_without(*foremost[0][::2])
         return foremost
-
-    def _at_their_instants(self, leading):
-        """The leading ones, with steps in the gap between epochs where they fit best."""
-        tests, n, found = self._tests, self.parts.n, []
-        self._finer.clear()
-        for item in leading:
-            hypothesis, variance = item[0], self.ranking.scores[0].variance
-            finer = step_at_every_gap(tests, self.ranking, hypothesis, variance)
-            best = best_instant(finer, hypothesis, tests) if finer else None
-            if finer and best:
-                refined, drop, amplitudes = best
-                self._finer[_said(refined)] = finer
-                item = refined, evidence(refined, drop, amplitudes, variance, n), amplitudes
-            found.append(item)
-        return sorted(found, key=lambda item: -item[1])
-
-    def _with_slow_beginnings(self, leading):
-        """The leading ones, and right after each step what settles from its moment on."""
-        found = []
-        for hypothesis, own, amplitudes in leading:
-            found.append((hypothesis, own, amplitudes))
-            slow = begun_slowly(self.ranking, hypothesis, self.current.scene)
-            if slow is not None and len(found) <= _BEGINNINGS:
-                found.append((slow, own, amplitudes))
-        return found
 
     def _accepted(self, leading, progress: Callable[[str], None]) -> Accepted | None:
         """The hypothesis that is significant and that the held-out epochs prove."""
@@ -317,7 +292,7 @@ class Search:
         form = FORMS[chosen.hypothesis.course.form]
         if not form.constants or form.constants[0].refined:
             return stds
-        ranking = self._finer.get(_said(chosen.hypothesis), self.ranking)
+        ranking = self._finer.get(said(chosen.hypothesis), self.ranking)
         spread = spread_of_constant(ranking, chosen.hypothesis, self.current.scene)
         return (*stds[: chosen.effect.n_columns], spread, *stds[chosen.effect.n_columns + 1 :])
 
@@ -462,11 +437,6 @@ class Search:
         scene = self.current.scene
         self.current = self.parts.fit(scene.with_effects(effects, scene.room))
         self.findings = [self.findings[k] for k in kept]
-
-
-def _said(hypothesis: Hypothesis) -> tuple:
-    """What a hypothesis says, under any name."""
-    return hypothesis.group, hypothesis.course, hypothesis.scope
 
 
 def _alternatives(accepted: Accepted, leading) -> tuple[Hypothesis, ...]:
