@@ -93,10 +93,14 @@ class Entry:
             self.fail(key, f"{self.title(key)} is {value}; it must be a number above 0")
         return value
 
-    def count(self, key: str) -> int:
-        value = self.needs(key, "a whole number")
-        if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-            self.fail(key, f"{self.title(key)} is {value!r}; it must be a whole number from 1")
+    def count(self, key: str, default: int | float | None = None, least: int = 1) -> int:
+        """A whole number of at least so many."""
+        if default is None:
+            self.needs(key, "a whole number")
+        value = self.table.get(key, default)
+        if not isinstance(value, int) or isinstance(value, bool) or value < least:
+            problem = f"{self.title(key)} is {value!r}; it must be a whole number from {least}"
+            self.fail(key, problem)
         return value
 
     def vector(self, key: str, length: int) -> np.ndarray | None:

@@ -47,7 +47,7 @@ def _description(root: Entry, file: str) -> Description:
     root.only(_ROOT)
     name = root.choice("layout", tuple(LAYOUTS))
     layout = LAYOUTS[name]
-    stations = _count(root, "stations", layout.stations, layout.least)
+    stations = root.count("stations", layout.stations, layout.least)
     if name == "station" and stations != 1:
         root.fail("stations", 'layout "station" is one station; give cameras.count in its place')
     structure = _structure(root.entry("structure"), name)
@@ -64,7 +64,7 @@ def _description(root: Entry, file: str) -> Description:
     if name == "station" and observe == "both":
         root.fail("observe", 'layout "station" has either "pixels" or "links"; choose one')
     time = root.entry("time").only(("epochs", "interval_s"))
-    epochs = _count(time, "epochs", 1)
+    epochs = time.count("epochs", 1)
     interval = time.positive("interval_s", 600.0)
     if observe == "links" and epochs > 1:
         time.fail("epochs", 'links alone have one epoch; set observe = "both" or epochs = 1')
@@ -78,7 +78,7 @@ def _description(root: Entry, file: str) -> Description:
         stations=stations,
         held=tuple(root.names("held") or ()),
         observe=observe,
-        seed=_count(root, "seed", 0, 0),
+        seed=root.count("seed", 0, 0),
         structure=structure,
         reach_m=sights.positive("reach_m", 1.0) if "reach_m" in sights else None,
         both_ways=_flag(sights, "both_ways", layout.both_ways),
@@ -104,7 +104,7 @@ def _structure(entry: Entry, layout: str) -> dict[str, float]:
                 key, f'unknown key "{key}" for layout "{layout}"; {did_you_mean(key, sizes)}'
             )
     return {
-        key: _count(entry, key, size) if isinstance(size, int) else entry.positive(key, size)
+        key: entry.count(key, size) if isinstance(size, int) else entry.positive(key, size)
         for key, size in sizes.items()
     }
 
@@ -121,7 +121,7 @@ def _cameras(root: Entry, layout: str) -> Cameras:
             'each = "sector"',
         )
     sectors = each == "sector" and layout != "station"
-    count = _count(entry, "count", 4 if sectors else 6, 2 if layout == "station" else 1)
+    count = entry.count("count", 4 if sectors else 6, 2 if layout == "station" else 1)
     size = entry.vector("image_size", 2)
     size = np.array([2448.0, 2048.0]) if size is None else size
     if not (size == np.round(size)).all() or not (size >= 64).all():
@@ -170,7 +170,7 @@ def _marks(entry: Entry, size: float) -> Marks:
     return Marks(
         kind,
         # Fewer marks than six leave a pose with two solutions.
-        _count(entry, "count", 16 if body else 4, 6 if body else 3),
+        entry.count("count", 16 if body else 4, 6 if body else 3),
         entry.positive("size_m", size),
         float(np.radians(tilt)),
         float(np.radians(incidence)),
@@ -257,14 +257,6 @@ def _links(entry: Entry) -> LinkNoise:
         entry.positive("turn_factor", 1.0),
         entry.positive("depth_factor", 1.0),
     )
-
-
-def _count(entry: Entry, key: str, default: int | float, least: int = 1) -> int:
-    """A whole number of at least so many."""
-    value = entry.table.get(key, default)
-    if not isinstance(value, int) or isinstance(value, bool) or value < least:
-        entry.fail(key, f"{entry.title(key)} is {value!r}; it must be a whole number from {least}")
-    return value
 
 
 def _flag(entry: Entry, key: str, default: bool) -> bool:
