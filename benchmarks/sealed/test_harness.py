@@ -8,7 +8,9 @@ import pytest
 from judge import _sizes, claims, covered, judge
 from names import Facts, same_name, same_place
 from power import facts_of, plain_fit, shown, whitened
+from scipy.integrate import solve_ivp
 from tally import wilson
+from world import heat
 
 from jaxvm.discover.cells import arrange
 from jaxvm.recording import read_recording
@@ -221,3 +223,14 @@ def test_only_like_sizes_are_compared():
     other = {**finding, "driver": "body_a_degC - ambient_degC"}
     warm = {**truth, "driver": "body_a_degC"}
     assert "other driver" in _sizes(warm, other, FACTS)["not_compared"]
+
+
+@pytest.mark.parametrize("tau", [4.0, 45.0, 2000.0])
+def test_lags_of_the_world_are_the_differential_equation(tau):
+    t = heat.STEP * np.arange(60)
+    x = 3.0 + np.sin(t / 70.0)
+    exact = solve_ivp(
+        lambda at, y: (np.interp(at, t, x) - y) / tau, t[[0, -1]], x[:1], "LSODA", t,
+        max_step=2.0, rtol=1e-9, atol=1e-11,
+    )  # fmt: skip
+    np.testing.assert_allclose(heat.lagged(x, tau), exact.y[0], atol=2e-6)

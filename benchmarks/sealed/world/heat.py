@@ -157,9 +157,10 @@ def body_temperatures(rng, time, air, count):
 
 
 def lagged(values, tau):
-    """First-order lag (s) of a course on the grid, settled at its start."""
+    """First-order lag (s) of a course that is linear between grid points, settled at its start."""
     a = np.exp(-STEP / tau)
-    return lfilter([1.0 - a], [1.0, -a], values, zi=[a * values[0]])[0]
+    now = 1.0 - (1.0 - a) * tau / STEP
+    return lfilter([now, 1.0 - a - now], [1.0, -a], values, zi=[(1.0 - now) * values[0]])[0]
 
 
 def play(values, width):
