@@ -11,8 +11,9 @@ from dataclasses import replace
 import numpy as np
 
 from jaxvm.discover.advice import advise
-from jaxvm.discover.constants import other_instants
+from jaxvm.discover.constants import other_instants, run_away
 from jaxvm.discover.diagnosis import Diagnosis, Finding, Quality
+from jaxvm.discover.first_states import with_first_states
 from jaxvm.discover.gross import without_gross_errors
 from jaxvm.discover.heldout import (
     HeldOut,
@@ -81,6 +82,7 @@ def diagnose(
     progress("final fit to all epochs")
     final = adjust(current.scene, weights=parts.sound, check=False)
     final = _with_best_instants(final, parts.sound)
+    final = _with_first_states(final, parts.sound)
     excess = 2.0 * plain.cost - current.variance_factor * plain.degrees_of_freedom
     findings = [replace(f, share=float(f.drop / max(excess, 1e-9))) for f in findings]
     findings = _with_final_values(final, findings, len(effects), parts.sound)
@@ -167,6 +169,15 @@ def _with_best_instants(final: Adjustment, weights) -> Adjustment:
     return final
 
 
+def _with_first_states(final: Adjustment, weights) -> Adjustment:
+    """The final fit with lags that need not have started in equilibrium."""
+    scene = with_first_states(final.scene)
+    if scene is final.scene:
+        return final
+    tried = adjust(scene, weights=weights, rtol=1e-8, check=False)
+    return final if tried.failed or run_away(scene, tried.scene) else tried
+
+
 def _with_final_values(
     final: Adjustment, findings: list[Finding], given: int, sound: tuple[np.ndarray, ...]
 ) -> list[Finding]:
@@ -189,7 +200,8 @@ def _with_final_values(
             ),
             noise=noise.inflation,
         )
-        for f, (effect, stds, noise) in zip(findings, list(values)[given:], strict=True)
+        # After the findings come first states.
+        for f, (effect, stds, noise) in zip(findings, list(values)[given:], strict=False)
     ]
 
 

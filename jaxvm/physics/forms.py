@@ -203,6 +203,7 @@ FORMS: dict[str, Form] = {
             "following {driver} with a lag, from a state of its own at first",
             centred=True,
         ),
+        Form("first state", ("first state",), (_TAU,), "fading from where it was at first"),
         Form(
             "two lags",
             ("lag", "slow lag"),
