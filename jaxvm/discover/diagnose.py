@@ -22,6 +22,7 @@ from jaxvm.discover.heldout import (
     hold_out,
     split,
 )
+from jaxvm.discover.inputs import variances_by_inputs
 from jaxvm.discover.locate import ResidualTable, locate, residual_table
 from jaxvm.discover.noise import Correlation, met
 from jaxvm.discover.scatter import ALIKE, likeness
@@ -183,25 +184,32 @@ def _with_final_values(
 ) -> list[Finding]:
     """Findings with the values of the fit to all epochs.
 
-    Noise that is correlated widens them. An instant that no fit refines keeps the spread of those
-    that did nearly as well.
+    Noise that is correlated widens them, and so do errors of the log. An instant that no fit
+    refines keeps the spread of those that did nearly as well.
     """
     noise = Correlation.of(final, fitted_residuals(final, sound))
     values = zip(
-        final.scene.fitted_effects(), effect_deviations(final), met(final, noise), strict=True
+        final.scene.fitted_effects(),
+        effect_deviations(final),
+        met(final, noise),
+        variances_by_inputs(final),
+        strict=True,
     )
     return [
         replace(
             f,
             final_effect=effect,
             final_stds=tuple(
-                float(np.sqrt(ratio)) * own or first
-                for own, ratio, first in zip(stds, noise.ratio, f.stds or stds, strict=True)
+                np.where(
+                    np.array(stds) > 0.0,
+                    np.sqrt(noise.ratio * np.square(stds) + by_inputs),
+                    f.stds or stds,
+                ).tolist()
             ),
             noise=noise.inflation,
         )
         # After the findings come first states.
-        for f, (effect, stds, noise) in zip(findings, list(values)[given:], strict=False)
+        for f, (effect, stds, noise, by_inputs) in zip(findings, list(values)[given:], strict=False)
     ]
 
 

@@ -113,11 +113,13 @@ def influence(adjustment: Adjustment, positions: np.ndarray) -> Residuals:
     """
     problem = adjustment.problem
     columns = np.asarray(problem.column)[positions]
-    units = np.zeros((problem.n, len(columns)))
+    # Spare columns: a few effects more or less are no other program.
+    units = np.zeros((problem.n, _AT_ONCE * -(-len(columns) // _AT_ONCE)))
     live = np.flatnonzero(columns < problem.n)
     units[columns[live], live] = np.asarray(problem.factor)[positions[live]]
     steps = jnp.asarray(_solve(_factors(adjustment), jnp.asarray(units)))
     weights = _along(problem, adjustment.x, steps)
+    weights = jax.tree.map(lambda block: block[..., : len(columns)], weights)
     tables = zip(weights.pixels, adjustment.scene.tables, strict=True)
     return weights._replace(pixels=tuple(block[: len(rows)] for block, rows in tables))
 
