@@ -36,20 +36,26 @@ def sample_error(values: Float[np.ndarray, " samples"]) -> float:
 
 
 def variances_by_inputs(fitted: Adjustment, seed: int = 0) -> list[Float[np.ndarray, " values"]]:
-    """Variances that errors of the log give to the amplitudes and constants of each effect."""
+    """Variances that errors of the log give to the amplitudes and constants of each effect.
+
+    Zero for effects that follow nothing that was logged.
+    """
     scene, layout = fitted.scene, fitted.problem.network.layout
-    channels = scene.network.channels
+    channels, drivers = scene.network.channels, scene.recording.drivers
     amplitude, constant = layout.all("amplitude"), layout.all("constant")
     places = [
         np.concatenate([amplitude[columns], constant[constants]])
         for columns, constants in scene.places()
     ]
     found = [np.zeros(len(own)) for own in places]
-    drivers = scene.recording.drivers
-    used = [channels.kinds[channels.index(effect.driver)] in _LOGGED for effect in scene.effects]
-    if drivers is None or not any(used):
+    logged = [
+        k
+        for k, effect in enumerate(scene.effects)
+        if channels.kinds[channels.index(effect.driver)] in _LOGGED
+    ]
+    if drivers is None or not logged:
         return found
-    weights = influence(fitted, np.concatenate(places))
+    weights = influence(fitted, np.concatenate([places[k] for k in logged]))
     base = fitted.residuals()
     rng = np.random.default_rng(seed)
     moved = []
@@ -59,8 +65,10 @@ def variances_by_inputs(fitted: Adjustment, seed: int = 0) -> list[Float[np.ndar
         pairs = zip(jax.tree.leaves(weights), jax.tree.leaves(change), strict=True)
         moved.append(sum(np.tensordot(own, np.asarray(weight), own.ndim) for weight, own in pairs))
     variance = np.mean(np.square(moved), axis=0)
-    ends = np.cumsum([len(own) for own in places])[:-1]
-    return np.split(variance, ends)
+    ends = np.cumsum([len(places[k]) for k in logged])[:-1]
+    for k, own in zip(logged, np.split(variance, ends), strict=True):
+        found[k] = own
+    return found
 
 
 def _drawn(fitted: Adjustment, drivers: Drivers, rng: np.random.Generator):
