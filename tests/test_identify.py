@@ -124,14 +124,18 @@ def test_a_delay_is_recovered():
     assert abs(found.tau[0] - 600.0) < 4.0 * found.tau_sigma[0]
 
 
-@settings(max_examples=12, deadline=None)
-@given(st.floats(300.0, 5000.0), st.integers(0, 10**6))
-def test_the_chosen_order_is_that_of_the_system(tau, seed):
-    inputs = made_inputs(seed)
-    _, one = outputs(inputs, (tau,), seed)
-    fits = [fit(inputs, one, np.ones_like(one), s, BLOCKS, LARGE) for s in CONTINUOUS[:5:2]]
+def test_the_chosen_order_is_that_of_the_system():
+    """Odds of 20:1 for a further state let at most one system in twenty have one too many."""
     assert [s.order for s in CONTINUOUS[:5:2]] == [0, 1, 2]
-    assert _choice(fits)[0] == 1
+    rng = np.random.default_rng(7)
+    chosen = []
+    for tau, seed in zip(rng.uniform(300.0, 5000.0, 40), rng.integers(10**6, size=40), strict=True):
+        inputs = made_inputs(int(seed))
+        _, one = outputs(inputs, (tau,), int(seed))
+        fits = [fit(inputs, one, np.ones_like(one), s, BLOCKS, LARGE) for s in CONTINUOUS[:5:2]]
+        chosen.append(_choice(fits)[0])
+    assert min(chosen) == 1
+    assert np.mean(np.array(chosen) > 1) <= 0.05
 
 
 def test_equation_error_is_biased_by_noise_and_output_error_is_not():
