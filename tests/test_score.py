@@ -108,7 +108,7 @@ def test_maps_are_scored_as_by_dense_matrices(stereo, monkeypatch):
             g = np.stack(
                 [
                     cells.tangent[PORT_INDEX[term.port]]
-                    * np.tile(tests._pattern(term, None), tests.arrangement.components)
+                    * np.tile(tests._pattern(term), tests.arrangement.components)
                     * course[:, None]
                     for term in family.groups[0].terms
                 ]

@@ -135,7 +135,8 @@ def arrange(adjustment: Adjustment) -> Arrangement:
             drivers.append(np.asarray(range_driver_table(scene, factor))[:n])
         views.append(np.asarray(factor.view)[:n])
         epoch = views[-1] % len(scene.recording.time)
-        keys.append(np.stack([group, epoch, entity], axis=1))
+        # Cells of one camera lie together.
+        keys.append(np.stack([entity, group, epoch], axis=1))
         for parts, own in ((residuals, r), (halves, half), (tangents, tangent)):
             parts.append(np.asarray(own)[:n])
     key = np.concatenate(keys)
@@ -148,9 +149,9 @@ def arrange(adjustment: Adjustment) -> Arrangement:
         tangent=np.ascontiguousarray(np.moveaxis(tangent, 2, 0)),
         residual=_by_component(residuals, rows, components),
         half=_by_component(halves, rows, components),
-        group=padded_lists(distinct[:, 0], n_groups, len(distinct)),
-        group_of=np.where(distinct[:, 0] < 0, n_groups, distinct[:, 0]),
-        epoch_of=distinct[:, 1],
+        group=padded_lists(distinct[:, 1], n_groups, len(distinct)),
+        group_of=np.where(distinct[:, 1] < 0, n_groups, distinct[:, 1]),
+        epoch_of=distinct[:, 2],
         n_epochs=len(scene.recording.time),
         n_local=problem.sizes[2],
     )

@@ -18,8 +18,8 @@ _ABSORBED = 1e-8
 _FEWEST_EPOCHS = 3.0
 """A hypothesis that fewer epochs carry than this can't be told from a few bad images."""
 
-CELLS = 64
-"""Cells whose tangents are multiplied at a time."""
+CELLS = 256
+"""Cells whose tangents are multiplied at a time: of fewer, threads wait for each other."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,8 @@ class Tangents:
     def shared(self, part: Part) -> Float[np.ndarray, "b columns shared"]:
         """What the shared unknowns see of each course."""
         assert self.halves is not None
-        return _summed(part, at_cells(self.halves[:, :, self.n_local :], part.place.cells))
+        # With the local columns: what lies together is multiplied without a copy.
+        return _summed(part, at_cells(self.halves, part.place.cells))[:, :, self.n_local :]
 
     def gram(self, part: Part) -> Float[np.ndarray, "b columns columns"]:
         """Products of each course's columns, term by term."""
@@ -79,8 +80,9 @@ class Tangents:
 
 
 def at_cells(values: np.ndarray, cells: np.ndarray) -> np.ndarray:
-    """Values of some cells, in ascending order; of all of them without a copy."""
-    return values if len(cells) == len(values) else values[cells]
+    """Values of some cells, in ascending order; of those that lie together without a copy."""
+    first, last = cells[0], cells[-1] + 1
+    return values[first:last] if last - first == len(cells) else values[cells]
 
 
 def _summed(part: Part, values: Float[np.ndarray, "n terms ..."]) -> np.ndarray:
@@ -117,8 +119,10 @@ def information_of(
         padded = np.concatenate([own, np.zeros((1, k, d))])[place.group]
         few = place.group.size * place.group.shape[1] * k**2 <= MOST_PRODUCTS
         if few and part.within is not None:
-            alike = np.einsum("gvkd,gwld->gvwkl", padded, padded, optimize=True)
-            taken = part.within @ alike.reshape(-1, k * k)
+            g, wide = place.group.shape
+            rows = padded.reshape(g, wide * k, d)
+            alike = (rows @ np.swapaxes(rows, 1, 2)).reshape(g, wide, k, wide, k)
+            taken = part.within @ np.swapaxes(alike, 2, 3).reshape(-1, k * k)
             taken = taken.reshape(b, n_bases, n_bases, k, k).transpose(0, 3, 1, 4, 2)
             information -= taken.reshape(b, columns, columns)
         else:
@@ -134,7 +138,7 @@ def information_of(
     whitener = whitener_of(scaled)
     seen = np.diagonal(scaled, axis1=1, axis2=2).max(axis=1)
     of_epoch = gathered(tangents.sizes(place.cells), place.epoch)  # E w
-    carried = np.einsum("ebw,ew->be", part.by_epoch**2, of_epoch, optimize=True)
+    carried = (part.by_epoch**2 @ of_epoch[:, :, None])[:, :, 0].T
     carried = carried.reshape(b, n_bases, -1).sum(axis=1)
     total = carried.sum(axis=1)
     # By the size of the effect, not its square: a near image does not make others count less.

@@ -21,14 +21,15 @@ import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from itertools import islice
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxvm.discover.battery import Battery, Part, battery
 from jaxvm.discover.cells import Arrangement, Cells, arrange
+from jaxvm.discover.groups import Group
 from jaxvm.discover.hypotheses import Family
+from jaxvm.discover.once import once
 from jaxvm.discover.products import (
     CELLS,
     Information,
@@ -45,7 +46,7 @@ from jaxvm.physics.effects import Term
 from jaxvm.physics.ports import PORT_INDEX
 from jaxvm.solve.adjust import Adjustment
 
-_STACKED = 16
+_STACKED = 48
 """Terms whose tangents are multiplied at a time, of as many groups as have them."""
 
 
@@ -110,98 +111,168 @@ class ScoreTests:
         cells = self.arrangement.cells
         e = cells.residual if residual is None else self.arrangement.in_cells(residual)
         tested = _Tested.of(cells, e, variance, signs)
-        self._evaluate_patterns()
+        scores = tuple(_unscored(f, tested) for f in self.battery.families)
         # NumPy lets other threads run while it multiplies.
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            each = pool.map(lambda f: self._of_family(f, tested), range(len(self.battery.families)))
-            scores = tuple(each)
-        return Ranking(scores, np.max([s.null.max(axis=0) for s in scores], axis=0))
+            self._evaluate_patterns(pool)
+            for _ in pool.map(lambda own: self._score_groups(own, tested, scores), self._batches()):
+                pass
+        for own in scores:
+            drop = own.drop[own.valid] / tested.variance
+            own.z[own.valid] = surprise(drop, own.amplitude.shape[-1])
+        return Ranking(scores, np.max([own.null.max(axis=0) for own in scores], axis=0))
 
-    def _of_family(self, number: int, tested: "_Tested") -> Scores:
-        family, parts = self.battery.families[number], self.battery.parts[number]
-        shape = family.valid.shape
-        drop, z, seen = np.zeros(shape), np.full(shape, -np.inf), np.zeros(shape)
-        sound = np.zeros(shape, bool)
-        amplitude = np.zeros((*shape, family.n_terms * family.n_bases))
-        null = np.full((shape[0], tested.repetitions), -np.inf)
-        wanted = [
-            (number, g, p)
-            for p, part in enumerate(parts)
-            for g in np.flatnonzero(family.valid[:, part.courses, part.scope].any(axis=1))
-        ]
+    def _batches(self) -> Iterator[list[tuple[int, int]]]:
+        """Groups by family and number, so many that they have about `_STACKED` terms."""
+        own, terms = [], 0
+        for number, family in enumerate(self.battery.families):
+            for g in range(len(family.groups)):
+                own.append((number, g))
+                terms += family.n_terms
+                if terms >= _STACKED:
+                    yield own
+                    own, terms = [], 0
+        if own:
+            yield own
+
+    def _score_groups(
+        self, groups: list[tuple[int, int]], tested: "_Tested", scores: tuple[Scores, ...]
+    ) -> None:
+        wanted = []
+        for number, g in groups:
+            valid = self.battery.families[number].valid[g]
+            for p, part in enumerate(self.battery.parts[number]):
+                if valid[part.courses, part.scope].any():
+                    wanted.append((number, g, p))
         # Where the information is known and no signs are flipped, products with residuals do.
         full = tested.flips or any(key not in self._known for key in wanted)
-        for g, tangents in enumerate(self._tangents(family, tested.residual, full)):
-            product = tangents.product
-            for p, part in enumerate(parts):
-                here = g, part.courses, part.scope
-                if not family.valid[here].any():
-                    continue
-                key = number, g, p
-                shared = tangents.shared(part) if tested.flips or key not in self._known else None
-                if shared is not None and key not in self._known:
-                    self._known[key] = information_of(tangents, part, shared, family.valid[here])
-                known = self._known[key]
-                seen[here], sound[here] = known.seen, known.sound
-                drop[here], amplitude[here] = drop_of(known, part, product)
-                if shared is not None and tested.flips and known.sound.any():
-                    null[g] = np.maximum(null[g], _flipped(known, part, product, shared, tested))
-        for part in parts:
-            part.forget()
-        z[sound] = surprise(drop[sound] / tested.variance, amplitude.shape[-1])
-        return Scores(family, drop, z, amplitude, seen, null, sound, tested.variance)
+        tangents = self._tangents(groups, tested.residual, full)
+        for key in wanted:
+            self._score_part(key, tangents[key[:2]], tested, scores[key[0]])
+        for number in {number for number, _ in groups}:
+            for part in self.battery.parts[number]:
+                part.forget()
 
-    def _tangents(self, family: Family, residual: np.ndarray, full: bool) -> Iterator[Tangents]:
-        """Products of the tangents of each group, some groups and some cells at a time.
+    def _score_part(
+        self, key: tuple[int, int, int], tangents: Tangents, tested: "_Tested", scores: Scores
+    ) -> None:
+        number, g, p = key
+        part, product = self.battery.parts[number][p], tangents.product
+        here = g, part.courses, part.scope
+        shared = tangents.shared(part) if tested.flips or key not in self._known else None
+        if shared is not None and key not in self._known:
+            valid = self.battery.families[number].valid[here]
+            self._known[key] = information_of(tangents, part, shared, valid)
+        known = self._known[key]
+        scores.seen[here], scores.valid[here] = known.seen, known.sound
+        scores.drop[here], scores.amplitude[here] = drop_of(known, part, product)
+        if shared is not None and tested.flips and known.sound.any():
+            flipped = _flipped(known, part, product, shared, tested)
+            scores.null[g] = np.maximum(scores.null[g], flipped)
 
-        What is multiplied stays in the cache, and what all groups share is read once for some.
+    def _tangents(
+        self, groups: list[tuple[int, int]], residual: np.ndarray, full: bool
+    ) -> dict[tuple[int, int], Tangents]:
+        """Products of the tangents of some groups."""
+        families, height = self.battery.families, residual.shape[1]
+        found, alike = {}, []
+        for key in groups:
+            group = families[key[0]].groups[key[1]]
+            if group.mark is not None:
+                found[key] = self._of_mark(group, group.mark, residual, full)
+            # Of very many terms the products would take more room than the tangents.
+            elif len(group.terms) > height:
+                (found[key],) = self._of_groups([group], residual, full, wide=True)
+            else:
+                alike.append(key)
+        some = [families[number].groups[g] for number, g in alike]
+        if some:
+            products = self._of_groups(some, residual, full, wide=False)
+            found.update(zip(alike, products, strict=True))
+        return found
+
+    def _of_groups(
+        self, groups: list[Group], residual: np.ndarray, full: bool, wide: bool
+    ) -> Iterator[Tangents]:
+        """Products of the tangents of groups that act on all marks, some cells at a time.
+
+        What is multiplied stays in the cache, and what all groups share is read once.
         """
-        cells, groups = self.arrangement.cells, iter(family.groups)
-        n, height = residual.shape
+        cells, (n, height) = self.arrangement.cells, residual.shape
         by_component = n, self.arrangement.components, -1
-        # Of very many terms the products would take more room than the tangents.
-        wide = family.n_terms > height
-        at_once = 1 if wide else max(_STACKED // family.n_terms, 1)
-        while some := tuple(islice(groups, at_once)):
-            terms = [(group, term) for group in some for term in group.terms]
-            ends = np.cumsum([len(group.terms) for group in some])
-            own = [
-                (
-                    cells.tangent[PORT_INDEX[term.port]].reshape(by_component),
-                    self._pattern(term, group.mark)[:, None],
-                )
-                for group, term in terms
-            ]
-            product = np.empty((n, len(terms)))
-            halves = np.empty((n, len(terms), cells.half.shape[2])) if full else None
-            square = [] if wide else [np.empty((n, *2 * (family.n_terms,))) for _ in some]
-            stack = np.empty((n if wide else CELLS, len(terms), *own[0][0].shape[1:]))
-            for first in range(0, n, CELLS):
-                here = slice(first, min(first + CELLS, n))
-                apart = stack[here] if wide else stack[: min(CELLS, n - first)]
-                for k, (tangent, pattern) in enumerate(own):
-                    np.multiply(tangent[here], pattern[here], out=apart[:, k])
-                piece = apart.reshape(*apart.shape[:2], height)
-                product[here] = (piece @ residual[here, :, None])[:, :, 0]
-                if halves is not None:
-                    np.matmul(piece, cells.half[here], out=halves[here])
-                    for products, end in zip(square, ends, strict=False):
-                        group = piece[:, end - family.n_terms : end]
-                        np.matmul(group, np.swapaxes(group, 1, 2), out=products[here])
-            for g, end in enumerate(ends):
-                at = slice(end - family.n_terms, end)
-                half = None if halves is None else halves[:, at]
-                own_stack = stack.reshape(n, family.n_terms, height) if wide else None
-                products = None if wide else square[g]
-                yield Tangents(cells.n_local, products, own_stack, half, product[:, at])
+        ends = np.cumsum([len(group.terms) for group in groups])
+        each = [slice(end - len(g.terms), end) for g, end in zip(groups, ends, strict=True)]
+        own = [
+            (
+                cells.tangent[PORT_INDEX[term.port]].reshape(by_component),
+                self._pattern(term)[:, None],
+            )
+            for group in groups
+            for term in group.terms
+        ]
+        product = np.empty((n, len(own)))
+        halves = [np.empty((n, len(g.terms), cells.half.shape[2])) for g in groups if full]
+        square = [] if wide else [np.empty((n, *2 * (len(g.terms),))) for g in groups]
+        stack = np.empty((n if wide else CELLS, len(own), *own[0][0].shape[1:]))
+        for first in range(0, n, CELLS):
+            here = slice(first, min(first + CELLS, n))
+            apart = stack[here] if wide else stack[: min(CELLS, n - first)]
+            for k, (tangent, pattern) in enumerate(own):
+                np.multiply(tangent[here], pattern[here], out=apart[:, k])
+            piece = apart.reshape(*apart.shape[:2], height)
+            product[here] = (piece @ residual[here, :, None])[:, :, 0]
+            half = piece @ cells.half[here] if full else None
+            of_term = None if wide else np.einsum("nkr,nkr->nk", piece, piece)
+            for g, terms in enumerate(each):
+                if half is not None:
+                    halves[g][here] = half[:, terms]
+                if of_term is not None and len(groups[g].terms) == 1:
+                    square[g][here] = of_term[:, terms, None]
+                elif of_term is not None:
+                    alone = piece[:, terms]
+                    np.matmul(alone, np.swapaxes(alone, 1, 2), out=square[g][here])
+        for g, terms in enumerate(each):
+            yield Tangents(
+                cells.n_local,
+                None if wide else square[g],
+                stack.reshape(n, -1, height) if wide else None,
+                halves[g] if full else None,
+                product[:, terms],
+            )
 
-    def _pattern(self, term, mark: tuple[int, int] | None) -> Float[np.ndarray, "cells width"]:
-        """Pattern of a term over the observations of all cells, of one mark or of all."""
+    def _of_mark(
+        self, group: Group, mark: tuple[int, int], residual: np.ndarray, full: bool
+    ) -> Tangents:
+        """Products of the tangents of a group that acts on one mark: it is once in a cell."""
+        cells, (n, height) = self.arrangement.cells, residual.shape
+        here, place = self._marks[mark]
+        width = height // self.arrangement.components
+        rows = here[:, None], place[:, None] + width * np.arange(self.arrangement.components)
+        own = [
+            cells.tangent[PORT_INDEX[term.port]][rows] * self._pattern(term)[here, place][:, None]
+            for term in group.terms
+        ]
+        tangent = np.stack(own, axis=1)
+
+        def in_cells(values: np.ndarray) -> np.ndarray:
+            found = np.zeros((n, *values.shape[1:]))
+            found[here] = values
+            return found
+
+        return Tangents(
+            cells.n_local,
+            in_cells(tangent @ np.swapaxes(tangent, 1, 2)),
+            None,
+            in_cells(tangent @ cells.half[rows]) if full else None,
+            in_cells((tangent @ residual[rows][:, :, None])[:, :, 0]),
+        )
+
+    def _pattern(self, term: Term) -> Float[np.ndarray, "cells width"]:
+        """Pattern of a term over the observations of all cells."""
         own = self._patterns[_key(term)]
-        own = own if mark is None else own * self._mark_mask(mark)
         return own if term.weight == 1.0 else term.weight * own
 
-    def _evaluate_patterns(self) -> None:
+    def _evaluate_patterns(self, pool: ThreadPoolExecutor) -> None:
         """Those that are not known yet, all of a driver and a basis at a time."""
         alike: dict[tuple, dict[tuple, Term]] = {}
         for family in self.battery.families:
@@ -209,18 +280,33 @@ class ScoreTests:
                 for term in group.terms:
                     if _key(term) not in self._patterns:
                         alike.setdefault((term.driver, term.basis), {})[_key(term)] = term
-        for terms in alike.values():
-            values = np.asarray(patterns(tuple(terms.values()), self.arrangement.drivers))
-            self._patterns.update(zip(terms, self.arrangement.of_cells(values.T), strict=True))
 
-    def _mark_mask(self, mark: tuple[int, int]) -> Float[np.ndarray, "cells width"]:
+        def evaluated(terms: dict[tuple, Term]) -> np.ndarray:
+            values = np.asarray(patterns(tuple(terms.values()), self.arrangement.drivers))
+            return self.arrangement.of_cells(values.T)
+
+        for terms, values in zip(alike.values(), pool.map(evaluated, alike.values()), strict=True):
+            self._patterns.update(zip(terms, values, strict=True))
+
+    @once
+    def _marks(self) -> dict[tuple[int, int], tuple[np.ndarray, np.ndarray]]:
+        """Of each mark the cells that hold it, and its place in each."""
         obs, arrangement = self.scene.recording.observations, self.arrangement
+        number = self.scene.first_point[obs.target] + obs.point
         own = np.zeros(len(arrangement.drivers))
         for start, rows in zip(arrangement.starts, self.scene.tables, strict=False):
-            own[start : start + len(rows)] = (obs.target[rows] == mark[0]) & (
-                obs.point[rows] == mark[1]
-            )
-        return arrangement.of_cells(own)
+            own[start : start + len(rows)] = 1 + number[rows]
+        numbers = arrangement.of_cells(own)
+        here, place = np.nonzero(numbers)
+        label = numbers[here, place].astype(int) - 1
+        first = self.scene.first_point
+        ends = np.cumsum(np.bincount(label, minlength=first[-1]))
+        lists = np.split(np.argsort(label, kind="stable"), ends[:-1])
+        return {
+            (target, point): (here[lists[start + point]], place[lists[start + point]])
+            for target, start in enumerate(first[:-1])
+            for point in range(first[target + 1] - start)
+        }
 
 
 @dataclass(frozen=True)
@@ -254,6 +340,21 @@ class _Tested:
     def repetitions(self) -> int:
         """Repetitions of the null distribution."""
         return 1 if self.signs is None else self.signs.shape[1]
+
+
+def _unscored(family: Family, tested: _Tested) -> Scores:
+    """Room for the scores of a family."""
+    shape = family.valid.shape
+    return Scores(
+        family,
+        drop=np.zeros(shape),
+        z=np.full(shape, -np.inf),
+        amplitude=np.zeros((*shape, family.n_terms * family.n_bases)),
+        seen=np.zeros(shape),
+        null=np.full((shape[0], tested.repetitions), -np.inf),
+        valid=np.zeros(shape, bool),
+        variance=tested.variance,
+    )
 
 
 def _key(term: Term) -> tuple:
