@@ -46,7 +46,7 @@ from jaxvm.physics.effects import Term
 from jaxvm.physics.ports import PORT_INDEX
 from jaxvm.solve.adjust import Adjustment
 
-_STACKED = 48
+_STACKED = 32
 """Terms whose tangents are multiplied at a time, of as many groups as have them."""
 
 
