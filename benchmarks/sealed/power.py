@@ -21,6 +21,7 @@ from jaxvm.discover.diagnose import ROOM
 from jaxvm.discover.gross import without_gross_errors
 from jaxvm.discover.heldout import Split, hold_out, split
 from jaxvm.discover.ranking import Ranking
+from jaxvm.discover.scatter import MOST_IMAGES, families_of_images
 from jaxvm.discover.score import ScoreTests
 from jaxvm.discover.select import stacked
 from jaxvm.discover.space import enumerate_hypotheses, member
@@ -102,7 +103,11 @@ def shown(recording: Recording, change: Change, each: list[Change], noise: dict)
     variance = robust_variance(base)
     effects: tuple[Power, ...] = ()
     if each:
-        tests = ScoreTests.of(base, enumerate_hypotheses(base.scene))
+        families = enumerate_hypotheses(base.scene)
+        if len(base.scene.recording.time) <= MOST_IMAGES:
+            # What differs from image to image is asked apart, but it is a rival like any other.
+            families += families_of_images(base.scene)
+        tests = ScoreTests.of(base, families)
         effects = tuple(_power(base, parts, tests, variance, noise, *own) for own in each)
     floor = parts.evaluate(base.scene).rms_px
     return Shown(effects, floor, variance, facts_of(base.scene))

@@ -23,7 +23,7 @@ from jaxvm.physics.catalogue.entry import each
 ALIKE = 0.15
 """Correlation of neighbouring marks of one image from which what is left is no noise of marks."""
 
-_MOST = 400
+MOST_IMAGES = 400
 """Epochs up to which each can have an amount of its own."""
 
 _ALSO = 0.2
@@ -78,7 +78,7 @@ def of_each_image(
         without: the whitened residuals that a hypothesis leaves when it is fitted.
     """
     n_epochs = len(scene.recording.time)
-    if n_epochs > _MOST:
+    if n_epochs > MOST_IMAGES:
         return [], 1.0
     tests = tests.about(families_of_images(scene))
     ranking = tests.score(variance)
