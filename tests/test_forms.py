@@ -15,6 +15,7 @@ from jaxvm.physics.forms import (
     FORMS,
     N_KNOTS,
     bump,
+    delayed,
     evaluate_basis,
     first_order_lag,
     play,
@@ -152,6 +153,39 @@ def test_play_depends_on_the_order_and_not_on_the_rate():
     np.testing.assert_array_equal(np.asarray(play(held, 0.5))[::3], play(x, 0.5))
 
 
+@pytest.mark.parametrize("earlier", [-6.0, 6.0])
+def test_first_contact_is_what_was_before_the_recording(earlier):
+    """The contact that an earlier course has led to the end of its travel stays there."""
+    rng = np.random.default_rng(6)
+    x = np.concatenate([np.linspace(earlier, 0.0, 40), np.cumsum(rng.normal(size=200))])
+    whole = np.asarray(play(x, 1.5))[40:]
+    first = 0.0 if earlier < 0.0 else 2.0  # x was rising, or falling
+    start = np.concatenate([[0.0], x[40:]])
+    np.testing.assert_allclose(play(start, 1.5, first)[1:], whole, atol=1e-12)
+    assert np.abs(np.asarray(play(start, 1.5))[1:] - whole).max() > 0.3
+
+
+def test_no_refit_moves_a_first_contact():
+    slope = jax.jacfwd(play, argnums=2)(triangle(2.0, 1, 20), 0.5, 0.3)
+    assert not np.any(slope)
+
+
+# --- dead time ------------------------------------------------------------------------------------
+
+
+def test_dead_time_shifts_a_course():
+    t = irregular_times(300)
+    dead = 700.0
+
+    def signal(s):
+        return 3e-4 * s + 1.0
+
+    expected = np.where(t >= t[0] + dead, signal(t - dead), signal(t[0]))
+    np.testing.assert_allclose(delayed(signal(t), t, dead), expected, rtol=1e-12)
+    slope = jax.jacfwd(delayed, argnums=2)(signal(t), t, dead)
+    np.testing.assert_allclose(slope[t > t[0] + dead], -3e-4, rtol=1e-9)
+
+
 # --- memoryless bases -----------------------------------------------------------------------------
 
 
@@ -220,7 +254,8 @@ EXPECTED = {  # with the constants 2 and 0.5, written without the package
     "slow decay": np.exp(-np.maximum(X, 0.0) / 0.5),
     "staircase": np.array([-3, -1, 1, 1, 1, 5]),  # steps of 2, half a step off zero
     "rate": np.gradient(X, T / 3600.0),
-    "play": np.array([-3, -2.5, -2, -1.3, 0, 2]) - X,
+    "play": np.array([-4, -2.5, -2, -1.3, 0, 2]) - X,  # half way to the lower end at first
+    "delayed": np.concatenate([X[:1], X[1:] - 2.0 * np.diff(X) / np.diff(T)]),
     "bump": np.array([0, 0, 0, 0, 2 / 3, 0]),  # about 2, knots 0.5 apart
     **{f"knot {k}": spline_about(2.0 + 0.5 * k, 0.5, X) for k in range(max(N_KNOTS.values()))},
 }

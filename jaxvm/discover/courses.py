@@ -29,6 +29,9 @@ _DOUBLING = 7.0
 _STAIRS = [(share, k / 8.0) for share in np.geomspace(0.1, 0.5, 20).tolist() for k in range(8)]
 """Height of a stair as a share of a quantity's range, and where it begins: no refit moves them."""
 
+ENDS = (0.01, 1.99)
+"""Contacts at the ends of their travel, to which what was before a recording has led them."""
+
 _MOST_OF_MARKS = 3000
 """Hypotheses about single marks; where marks and instants are many, fewer instants are asked."""
 
@@ -139,6 +142,7 @@ def _of_quantity(driver: str, channels: Channels, lags: list[float]) -> list[Cou
             for form in ("lag", "lag with state")
             for tau in lags
         ),
+        *(Course(driver, "delay", (dead_time,), reference) for dead_time in lags[:3]),
         Course(driver, "two lags", (lags[1], lags[4]), reference),
         Course(driver, "proportional"),
         Course(driver, "square"),
@@ -174,6 +178,7 @@ def _of_own(driver: str, channels: Channels, lags: list[float]) -> list[Course]:
             for form in ("lag", "affine lag")
             for tau in lags
         ),
+        *(Course(driver, "delay", (dead_time,), reference) for dead_time in lags[:3]),
         *(_hysteresis(driver, width, reference) if width > 0.0 else ()),
     ]
 
@@ -248,8 +253,16 @@ _OF_KIND = {
 
 
 def _hysteresis(driver: str, width: float, reference: float) -> list[Course]:
-    """Play of some shares of the range that a quantity takes."""
-    return [Course(driver, "hysteresis", (share * width,), reference) for share in (0.1, 0.2, 0.3)]
+    """Play of some shares of the range that a quantity takes, the contact anywhere at first."""
+    halves = [share * width for share in (0.1, 0.2, 0.3)]
+    return [
+        *(Course(driver, "hysteresis", (half,), reference) for half in halves),
+        *(
+            Course(driver, "hysteresis with state", (half, first), reference)
+            for half in halves
+            for first in ENDS
+        ),
+    ]
 
 
 def _recorded(driver: str, channels: Channels) -> np.ndarray:

@@ -8,9 +8,9 @@ import numpy as np
 from jaxvm.discover.accept import Accepted, accept, short
 from jaxvm.discover.detail import with_detail
 from jaxvm.discover.diagnosis import Finding
+from jaxvm.discover.finer import at_finer_constants, said, with_slow_beginnings
 from jaxvm.discover.heldout import HeldOut, Split, gain
 from jaxvm.discover.hypotheses import FREE, Hypothesis
-from jaxvm.discover.instants import at_their_instants, said, with_slow_beginnings
 from jaxvm.discover.noise import Correlation, Met, met, random_signs
 from jaxvm.discover.pairs import better_pair, other_beginnings, worth_a_second_thought
 from jaxvm.discover.ranking import Ranking, spread_of_constant, surprise
@@ -117,7 +117,7 @@ class Search:
             first = first or self.ranking
             if len(self.findings) == most:
                 break
-            leading, self._finer = at_their_instants(
+            leading, self._finer = at_finer_constants(
                 leading, self._tests, self.ranking, self.parts.n
             )
             leading = with_slow_beginnings(leading, self.ranking, self.current.scene)

@@ -32,6 +32,9 @@ remainder outweighs any odds between rivals that differ by less than that.
 CLEAR = 15.0
 """Difference of foretold evidence between two courses of the same terms that a refit won't turn."""
 
+SOUGHT = ("step", "staircase", "hysteresis", "hysteresis with state")
+"""Forms that are asked at few constants and gain most by better ones: no tangent leads there."""
+
 _RTOL, _MAX_STEPS = 1e-6, 14
 
 _WIDE = 3.0
@@ -151,25 +154,27 @@ def shortlist(
     """The best hypotheses by evidence, one for each physics, place and kind of course.
 
     Returns (hypothesis, evidence, one-step amplitudes), best first; with at most so many `columns`.
+    Those that are behind, but may catch up on a finer grid, come on top.
     """
     seen: dict[tuple, float] = {}
-    chosen = []
+    chosen, behind = [], 0
     weighed = [
         (hypothesis, evidence(hypothesis, drop, amplitudes, variance, n), amplitudes)
         for hypothesis, drop, amplitudes in top(ranking, scene, 400, columns)
     ]
     for hypothesis, own, amplitudes in sorted(weighed, key=lambda item: -item[1]):
-        # The same terms at the same place in another course: only if it is nearly as good; or a
-        # step, which is asked at few instants, and gains most by a better one.
+        # The same terms at the same place in another course: only if it is nearly as good, or may
+        # become so on a finer grid.
         place = (hypothesis.group, hypothesis.scope)
         key = (identity(hypothesis), hypothesis.course.form)
-        behind = hypothesis.course.form != "step" and seen.get(place, own) - own > CLEAR
-        if key in seen or behind:
+        is_behind = seen.get(place, own) - own > CLEAR
+        if key in seen or (is_behind and hypothesis.course.form not in SOUGHT):
             continue
         seen.setdefault(place, own)
         seen[key] = own
+        behind += is_behind
         chosen.append((hypothesis, own, amplitudes))
-        if len(chosen) == count:
+        if len(chosen) - min(behind, count) == count:
             break
     return chosen
 

@@ -12,7 +12,7 @@ from typing import cast
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int
 
 Course = Float[Array, " times"]
 Constants = Float[Array, "2"]
@@ -37,17 +37,25 @@ def first_order_lag(x: Course, t: Course, tau: Float[Array, ""]) -> Course:
     return jnp.concatenate([x[:1], rest_of_course])
 
 
-def play(x: Course, half_width: Float[Array, ""]) -> Course:
+def delayed(x: Course, t: Course, dead_time: Float[Array, ""]) -> Course:
+    """Course of y(t) = x(t - dead time), at rest before the first sample."""
+    return cast(Array, jnp.interp(t - dead_time, t, x))
+
+
+def play(x: Course, half_width: Float[Array, ""], first: ArrayLike = 1.0) -> Course:
     """Play (backlash) operator of Prandtl and Ishlinskii: follows x with free travel either way.
 
-    The contact starts in the middle of its travel at the first sample.
+    What was before the recording decides where in its travel the contact is at the first sample:
+    `first` is 1 in the middle, 0 at the lower end (x was rising), 2 at the upper one.
     """
 
     def step(y, x_k):
         y = jnp.clip(y, x_k - half_width, x_k + half_width)
         return y, y
 
-    return jax.lax.scan(step, x[0], x)[1]
+    # Where the contact has left its first place nothing depends on it: no refit moves it.
+    start = x[0] + (jax.lax.stop_gradient(jnp.asarray(first)) - 1.0) * half_width
+    return jax.lax.scan(step, start, x)[1]
 
 
 def rate(x: Course, t: Course) -> Course:
@@ -82,12 +90,13 @@ BASES: dict[str, Callable[[Course, Course, Constants], Course]] = {
     "fourth": lambda x, t, c: x**4,
     "sixth": lambda x, t, c: x**6,
     "lag": lambda x, t, c: first_order_lag(x, t, c[0]),
+    "delayed": lambda x, t, c: delayed(x, t, c[0]),
     "slow lag": lambda x, t, c: first_order_lag(x, t, c[1]),
     "first state": lambda x, t, c: jnp.exp(-(t - t[0]) / c[0]),
     "rate": lambda x, t, c: rate(x, t),
     "aged": lambda x, t, c: x * (t - t[0]) / 3600.0,
     "direction": lambda x, t, c: jnp.tanh(rate(first_order_lag(x, t, c[1]), t) / c[0]),
-    "play": lambda x, t, c: play(x, c[0]) - x,
+    "play": lambda x, t, c: play(x, c[0], c[1]) - x,
     "onset": lambda x, t, c: -jnp.expm1(-jnp.maximum(x, 0.0) / c[0]),
     "log": lambda x, t, c: jnp.log1p(jnp.maximum(x, 0.0) / c[0]),
     "step": lambda x, t, c: jnp.where(x >= c[0], 1.0, 0.0),
@@ -203,6 +212,13 @@ FORMS: dict[str, Form] = {
             "following {driver} with a lag, from a state of its own at first",
             centred=True,
         ),
+        Form(
+            "delay",
+            ("delayed",),
+            (Constant("dead time", "s"),),
+            "following {driver} after a dead time",
+            centred=True,
+        ),
         Form("first state", ("first state",), (_TAU,), "fading from where it was at first"),
         Form(
             "two lags",
@@ -244,6 +260,13 @@ FORMS: dict[str, Form] = {
             ("linear", "play"),
             (Constant("half play", "driver"),),
             "with {driver} and with backlash",
+            centred=True,
+        ),
+        Form(
+            "hysteresis with state",
+            ("linear", "play"),
+            (Constant("half play", "driver"), Constant("first contact", "1", refined=False)),
+            "with {driver} and with backlash, from a contact of its own at first",
             centred=True,
         ),
         Form("onset", ("onset",), (_TAU,), "settling exponentially with {driver}"),

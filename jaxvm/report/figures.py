@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from jaxvm.discover.diagnosis import Diagnosis, Finding
 from jaxvm.discover.locate import ResidualTable
+from jaxvm.physics.catalogue.entry import HYSTERESIS
 
 BEFORE, AFTER, INK = "#c2410c", "#0f766e", "#334155"
 _STYLE: dict[Any, Any] = {
@@ -281,7 +282,7 @@ def _against_driver(diagnosis, finding, before, after, shift, fitted) -> Figure:
     figure, axes = _figure(9.0, 3.2, len(panels))
     for axis, (over, name) in zip(axes[0], panels, strict=True):
         order = np.argsort(over)
-        loop = finding.effect.form in ("hysteresis", "direction", "lag", "two lags", "rate")
+        loop = finding.effect.form in (*HYSTERESIS, "direction", "lag", "delay", "two lags", "rate")
         line = slice(None) if loop else order
         axis.plot(over, along(before), "o", ms=3.5, color=BEFORE, label="without the effect")
         axis.plot(over, along(after), "o", ms=2.5, color=AFTER, label="with the effect")

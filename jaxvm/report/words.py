@@ -20,7 +20,16 @@ _HOPELESS = 0.05
 
 _PORT = {port.name: port for port in PORTS}
 
-_PER_DRIVER = {"linear": 1, "lag": 1, "slow lag": 1, "play": 1, "square": 2, "ramp": 1, "rate": 1}
+_PER_DRIVER = {
+    "linear": 1,
+    "lag": 1,
+    "slow lag": 1,
+    "delayed": 1,
+    "play": 1,
+    "square": 2,
+    "ramp": 1,
+    "rate": 1,
+}
 """Power of the driver's unit under the unit of an amplitude, by basis."""
 
 

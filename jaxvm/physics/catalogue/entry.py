@@ -48,7 +48,8 @@ class Entry:
         return form in self.forms and any(kind in self.drivers for kind in kinds)
 
 
-THERMAL = ("linear", "lag", "lag with state", "two lags", "affine", "affine lag")
+HYSTERESIS = ("hysteresis", "hysteresis with state")
+THERMAL = ("linear", "lag", "lag with state", "delay", "two lags", "affine", "affine lag")
 """Forms of what follows a quantity, at once or late."""
 
 CHANGING = ("rate", "transient", "transient with state")

@@ -1,6 +1,15 @@
 """Named physics of lenses: principal distance, distortion, decentring, pupil."""
 
-from jaxvm.physics.catalogue.entry import ALWAYS, THERMAL, Entry, Terms, each, pair, plain
+from jaxvm.physics.catalogue.entry import (
+    ALWAYS,
+    HYSTERESIS,
+    THERMAL,
+    Entry,
+    Terms,
+    each,
+    pair,
+    plain,
+)
 from jaxvm.physics.effects import Term
 
 _FOCAL, _RADIAL = (plain("sensor.focal"),), (plain("lens.k1"),)
@@ -72,7 +81,7 @@ LENS: tuple[Entry, ...] = (
     Entry(
         "focal-hysteresis", "the focal length does not return with the temperature",
         (39, 79, 95),
-        _FOCAL, ("temperature",), ("hysteresis", "direction"), "camera",
+        _FOCAL, ("temperature",), (*HYSTERESIS, "direction"), "camera",
         (5e-7, 1e-3), "a slow thermal lag", "slow cycles; always approach from one side",
         "Elements of the lens or its focus drive have backlash. The principal distance depends on "
         "the direction from which the temperature came.",

@@ -1,6 +1,14 @@
 """Named physics of mounts and stations: what carries the cameras."""
 
-from jaxvm.physics.catalogue.entry import ALWAYS, CHANGING, SETTLING, THERMAL, Entry, axes
+from jaxvm.physics.catalogue.entry import (
+    ALWAYS,
+    CHANGING,
+    HYSTERESIS,
+    SETTLING,
+    THERMAL,
+    Entry,
+    axes,
+)
 from jaxvm.physics.effects import Term
 
 _TURN, _SHIFT = axes("mount.turn"), axes("mount.shift")
@@ -30,7 +38,7 @@ MOUNT: tuple[Entry, ...] = (
     ),
     Entry(
         "mount-hysteresis", "the camera turns in its mount with backlash", (25, 79),
-        _TURN, ("temperature",), ("hysteresis", "direction"), "camera",
+        _TURN, ("temperature",), (*HYSTERESIS, "direction"), "camera",
         (5e-7, 2e-4), "a slow thermal lag", "slow cycles: a lag shrinks, backlash does not",
         "Stick and slip in the mount make it return on another path than it went. The turn "
         "depends on the direction of the temperature's change.",
@@ -129,7 +137,7 @@ MOUNT: tuple[Entry, ...] = (
     ),
     Entry(
         "bracket-hysteresis", "the camera's bracket moves with backlash", (26, 79),
-        _SHIFT, ("temperature",), ("hysteresis", "direction"), "camera",
+        _SHIFT, ("temperature",), (*HYSTERESIS, "direction"), "camera",
         (2e-7, 2e-4), "a slow thermal lag", "slow cycles: a lag shrinks, backlash does not",
         "Joints of the bracket stick and slip as it grows and shrinks. The camera's place depends "
         "on the direction of the temperature's change.",

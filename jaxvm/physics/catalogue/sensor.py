@@ -1,6 +1,6 @@
 """Named physics of sensors, shutters and clocks."""
 
-from jaxvm.physics.catalogue.entry import ALWAYS, THERMAL, Entry, each, pair, plain
+from jaxvm.physics.catalogue.entry import ALWAYS, HYSTERESIS, THERMAL, Entry, each, pair, plain
 from jaxvm.physics.catalogue.maps import height_map
 from jaxvm.physics.effects import Term
 
@@ -34,7 +34,7 @@ SENSOR: tuple[Entry, ...] = (
     Entry(
         "principal-point-hysteresis", "the principal point does not return with the temperature",
         (51, 79),
-        _CENTRE, ("temperature",), ("hysteresis", "direction"), "camera",
+        _CENTRE, ("temperature",), (*HYSTERESIS, "direction"), "camera",
         (1e-3, 5e-1), "backlash of the mount", "slow cycles, a rolled camera",
         "Sensor or lens stick and slip as the body warms and cools. The image shifts and returns "
         "on another path.",

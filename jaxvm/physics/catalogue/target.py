@@ -3,6 +3,7 @@
 from jaxvm.physics.catalogue.entry import (
     ALWAYS,
     CHANGING,
+    HYSTERESIS,
     SETTLING,
     THERMAL,
     Entry,
@@ -58,7 +59,7 @@ TARGET: tuple[Entry, ...] = (
         "target-bends", "the target bends with its surroundings", (7,),
         pair("target.bow_x", "target.bow_y"),
         ("temperature", "humidity", "irradiance", "quantity"),
-        (*THERMAL, *CHANGING, "hysteresis"), "target",
+        (*THERMAL, *CHANGING, *HYSTERESIS), "target",
         (1e-8, 1e-3), "drift of the lens distortion", "watch a second target",
         "One-sided warming or moisture bends the plate. The bow follows the driver, often late.",
     ),
@@ -71,7 +72,7 @@ TARGET: tuple[Entry, ...] = (
     ),
     Entry(
         "target-swells", "the target swells with moisture", (2,),
-        (plain("target.scale"),), ("humidity",), (*THERMAL, "hysteresis"), "target",
+        (plain("target.scale"),), ("humidity",), (*THERMAL, *HYSTERESIS), "target",
         (5e-7, 3e-4), "thermal expansion", "log humidity and temperature",
         "The plate takes up moisture and grows alike along and across. It follows the humidity by "
         "hours and need not return on the same path.",
@@ -79,7 +80,7 @@ TARGET: tuple[Entry, ...] = (
     Entry(
         "target-growth-anisotropic", "the target grows differently along and across", (2,),
         pair("target.scale_x", "target.scale_y"), ("humidity", "temperature"),
-        (*THERMAL, "hysteresis"), "target",
+        (*THERMAL, *HYSTERESIS), "target",
         (5e-7, 3e-4), "thermal expansion, aspect", "roll the target; log humidity",
         "Paper, wood and laminates take up moisture and grow more across the grain than along it. "
         "The two scales of the plate then differ.",

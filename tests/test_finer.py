@@ -1,4 +1,4 @@
-"""Instants of steps: sought in every gap, and open on the side of a held-out epoch."""
+"""Constants that no refit moves, sought between the points of the grid; instants of steps."""
 
 from dataclasses import replace
 
@@ -10,13 +10,14 @@ from jaxvm.discover import courses
 from jaxvm.discover.constants import other_instants, run_away
 from jaxvm.discover.courses import gaps
 from jaxvm.discover.diagnose import _plain_fit
+from jaxvm.discover.finer import at_finer_constants, best_of, said, scores_about
 from jaxvm.discover.heldout import evaluate
-from jaxvm.discover.instants import best_instant, step_at_every_gap
 from jaxvm.discover.score import ScoreTests
 from jaxvm.discover.select import shortlist
 from jaxvm.discover.space import enumerate_hypotheses
 from jaxvm.network.residual import predict_pixels
 from jaxvm.physics.effects import Effect, Scope, Term
+from jaxvm.recording.recording import Drivers
 from jaxvm.solve.snooping import robust_variance
 
 N_EPOCHS = 80
@@ -55,9 +56,9 @@ def test_the_gap_is_found_between_points_of_the_grid(recorded, monkeypatch):
     ranking = tests.score(variance)
     leading = shortlist(ranking, plain.scene, variance, parts.n, 12)
     step = next(item for item in leading if item[0].course.form == "step")
-    finer = step_at_every_gap(tests, ranking, step[0], variance)
+    finer = scores_about(tests, ranking, step[0], variance)
     assert finer is not None
-    best = best_instant(finer, step[0], tests)
+    best = best_of(finer, step[0], tests)
     assert best is not None
     hypothesis, drop, amplitudes = best
     pause = np.median(np.diff(gaps("time", scene.network.channels)))
@@ -109,3 +110,62 @@ def test_constants_that_run_away_are_seen(recorded):
     after = scene.with_effects((replace(lag, constants=(-1.0,)),), (8, 4))
     assert run_away(before, after) and not run_away(before, before)
     assert not run_away(after, after)
+
+
+# --- stairs and plays -----------------------------------------------------------------------------
+
+
+def with_hidden(form, constants, terms, amplitudes, scope):
+    """A board with something hidden that follows the logged air, without it in the model.
+
+    Its camera is so quiet that little is enough, and the model is as good as linear in it.
+    """
+    known = board_recording(n_epochs=N_EPOCHS)
+    span = float(np.ptp(known.recording.time))
+    t = np.linspace(-0.05 * span, 1.05 * span, 400)
+    air = 20.0 + 6.0 * np.sin(9.0 * t / span) + 2.0 * np.sin(31.0 * t / span)
+    drivers = Drivers(t, {"ambient_degC": air})
+    plain = known.true_scene(replace(known.recording, drivers=drivers))
+    own = Effect("it", terms, "ambient_degC", form, constants, 20.0, scope, amplitudes)
+    truth = plain.with_effects((own,), (8, 4))
+    obs = known.recording.observations
+    obs = replace(obs, sigma=0.1 * obs.sigma)
+    pixel = np.zeros(obs.pixel.shape)
+    for rows, own in zip(truth.tables, predict_pixels(truth.state, truth.network), strict=True):
+        pixel[rows] = np.asarray(own)[: len(rows)]
+    pixel += obs.sigma[:, None] * np.random.default_rng(5).standard_normal(pixel.shape)
+    observations = replace(obs, pixel=pixel)
+    return known.true_scene(replace(plain.recording, observations=observations))
+
+
+@pytest.mark.parametrize(
+    ("form", "constants", "terms", "amplitudes", "scope"),
+    [
+        (
+            "hysteresis with state", (3.7, 1.9),
+            (Term("target.bow_x"),), (1e-6, 3e-5), Scope(target=("board",)),
+        ),
+        (
+            "staircase", (3.1, 0.31),
+            (Term("sensor.focal"),), (4e-4,), Scope(camera=("cam",)),
+        ),
+    ],
+)  # fmt: skip
+def test_constants_are_found_between_points_of_the_grid(form, constants, terms, amplitudes, scope):
+    """What fits best between the points of the grid fits better than the best on it."""
+    scene = with_hidden(form, constants, terms, amplitudes, scope)
+    parts, plain, _ = _plain_fit(scene, 3)
+    tests = ScoreTests.of(plain, enumerate_hypotheses(plain.scene))
+    variance = robust_variance(plain)
+    ranking = tests.score(variance)
+    leading = shortlist(ranking, plain.scene, variance, parts.n, 12)
+    own = next(
+        item for item in leading
+        if (item[0].course.form, item[0].group.terms, item[0].scope) == (form, terms, scope)
+    )  # fmt: skip
+    finer, about = at_finer_constants(leading, tests, ranking, parts.n)
+    best = next(item for item in finer if item[0].group.terms == terms and item[0].scope == scope)
+    assert best[0].course.form == form
+    assert best[1] > own[1] + 5.0
+    assert best[0].course.constants[0] == pytest.approx(constants[0], rel=0.05)
+    assert said(best[0]) in about
