@@ -149,6 +149,7 @@ def _effect(
         "rms_px": power["rms_px"],
         "own_share": max((power["drops"][name] for name in own_names), default=0.0)
         / max(power["expected_drop"], 1e-300),
+        "wrongly_first": _wrongly_first(found, alike, power["drops"]),
         "nearest": nearest,
         "gap": gaps.get(nearest),
         "shown": is_shown,
@@ -167,6 +168,15 @@ def _effect(
         result |= _sizes(truth, named, facts)
     result["reason"] = _reason(result, found, at, gaps)
     return result
+
+
+def _wrongly_first(found: list[dict], alike: dict, drops: dict) -> dict[str, float]:
+    """Names of findings that are not the right one, and how much of lambda each gives at most.
+
+    Where that is no less than the right name gives, the package's physics can't tell them apart.
+    """
+    told = [_label(claims(finding)[0]) for finding in found]
+    return {name: drops[name] for name in told if alike.get(name) is False}
 
 
 def _place(truth: dict, claim: dict, finding: dict, facts: Facts) -> str:

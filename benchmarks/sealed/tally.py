@@ -223,11 +223,25 @@ def failures(rows: list[dict]) -> list[str]:
             if effect["shown"] and effect["reason"]:
                 found.append(f"{name}: {effect['reason']}")
             elif effect["decidable"] and not effect["outside"] and not effect["first"]:
-                told = ", ".join(row["named"])
-                found.append(f"{name}: in the set but not first, though decidable; named {told}")
+                found.append(
+                    f"{name}: in the set but not first, though decidable; {_instead(row, effect)}"
+                )
         if not row["outside"] and row["floor_ratio"] > FLOOR_RATIO:
             found.append(f"{row['id']}: held-out RMS {row['floor_ratio']:.3f} times the floor")
     return found
+
+
+def _instead(row: dict, effect: dict) -> str:
+    """What was named first, and which share of lambda right and wrong name explain at most."""
+    words = f"named {', '.join(row['named'])}"
+    wrong = effect["wrongly_first"]
+    if not wrong:
+        return words
+    share = max(wrong.values()) / effect["expected_drop"]
+    return (
+        f"{words}, which explains {100 * share:.1f} % of lambda {effect['expected_drop']:.0f}, "
+        f"the right name {100 * effect['own_share']:.1f} %"
+    )
 
 
 def _text(value: float | None, unit: str) -> str:

@@ -33,6 +33,8 @@ _ALSO = 0.2
 def likeness(scene: Scene, residual: np.ndarray) -> float:
     """Correlation of the residuals of neighbouring marks in one image; 0 where it may be chance.
 
+    Of the camera where it is largest: one that jumps must not be lost among others that don't.
+
     Args:
         scene: the fitted scene.
         residual: whitened residuals [observations, 2] in the order of the recording, NaN where not
@@ -49,9 +51,17 @@ def likeness(scene: Scene, residual: np.ndarray) -> float:
     distance, nearest = (np.asarray(found)[:, 1] for found in KDTree(at).query(at, k=2))
     pairs = distance < 1e6
     own, other = residual[used][pairs], residual[used[nearest[pairs]]]
+    camera = obs.camera[used][pairs]
     # Gross errors and the tails of the noise shall not decide.
     limit = 4.0 * np.median(np.abs(residual[used])) / 0.67449
     own, other = np.clip(own, -limit, limit), np.clip(other, -limit, limit)
+    return max(
+        (_correlation(own[camera == c], other[camera == c]) for c in set(camera)), default=0.0
+    )
+
+
+def _correlation(own: np.ndarray, other: np.ndarray) -> float:
+    """Correlation of two series of residuals; 0 where it may be chance."""
     if not own.any():
         return 0.0
     value = float(np.mean(own * other) / np.mean(own**2))
