@@ -11,7 +11,11 @@ can open the key later without anyone doubting it.
 import argparse
 import hashlib
 import json
+import os
 from pathlib import Path
+
+# Sums by several threads differ in their last bits, and with them the hash of the key.
+os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
 import numpy as np
 from world import EFFECTS, KINDS, record
