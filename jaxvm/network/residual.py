@@ -3,6 +3,7 @@
 Simulation, adjustment, covariance, Monte Carlo and diagnosis all call what stands here.
 """
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -57,6 +58,14 @@ class Network(eqx.Module):
         others = (self.ranges, self.links, self.edges, self.closures, self.priors)
         return (*self.pixels, *(factor for factor in others if factor is not None))
 
+    def residuals(self, blocks: Sequence) -> "Residuals":
+        """Blocks of all tables, in the order of `factors`, by their names."""
+        n = len(self.pixels)
+        left = iter(blocks[n:])
+        others = (self.ranges, self.links, self.edges, self.closures, self.priors)
+        rest = (None if factor is None else next(left) for factor in others)
+        return Residuals(tuple(blocks[:n]), *rest)
+
 
 class Residuals(NamedTuple):
     """Whitened residuals, (predicted - measured) / sigma, block by block."""
@@ -82,17 +91,7 @@ def residual(state: State, network: Network) -> Residuals:
         used = factor.weight[:, None] > 0.0
         return jnp.where(used, rows(factor, network, at), 0.0) * whitening(factor)
 
-    def block(factor: Factor | None) -> Array | None:
-        return None if factor is None else whitened(factor)
-
-    return Residuals(
-        tuple(map(whitened, network.pixels)),
-        block(network.ranges),
-        block(network.links),
-        block(network.edges),
-        block(network.closures),
-        block(network.priors),
-    )
+    return network.residuals([whitened(factor) for factor in network.factors()])
 
 
 def whitening(factor: Factor) -> Float[Array, "observations components"]:

@@ -24,8 +24,8 @@ from jaxvm.solve.selected import SelectedInverse
 from jaxvm.solve.snooping import robust_variance
 from jaxvm.solve.sparse import Pattern, SparseFactors, sparse_normal
 
-_AT_ONCE = 8
-"""Columns of the Jacobian that are computed side by side."""
+_COLUMNS = 8
+"""Columns are solved for in multiples of so many: one effect more is no other program."""
 
 
 def covariance(
@@ -113,24 +113,28 @@ def influence(adjustment: Adjustment, positions: np.ndarray) -> Residuals:
     """
     problem = adjustment.problem
     columns = np.asarray(problem.column)[positions]
-    # Spare columns: a few effects more or less are no other program.
-    units = np.zeros((problem.n, _AT_ONCE * -(-len(columns) // _AT_ONCE)))
+    units = np.zeros((problem.n, _COLUMNS * -(-len(columns) // _COLUMNS)))
     live = np.flatnonzero(columns < problem.n)
     units[columns[live], live] = np.asarray(problem.factor)[positions[live]]
-    steps = jnp.asarray(_solve(_factors(adjustment), jnp.asarray(units)))
+    steps = np.asarray(_solve(_factors(adjustment), jnp.asarray(units)))[:, : len(columns)]
     weights = _along(problem, adjustment.x, steps)
-    weights = jax.tree.map(lambda block: block[..., : len(columns)], weights)
     tables = zip(weights.pixels, adjustment.scene.tables, strict=True)
     return weights._replace(pixels=tuple(block[: len(rows)] for block, rows in tables))
 
 
-@eqx.filter_jit
-def _along(problem: Problem, x, steps: Float[Array, "n k"]) -> Residuals:
-    """Change of all residuals along each of some steps, a few at a time: what is between a step and
-    its residuals takes far more room than they."""
-    _, change = jax.linearize(problem.residual, x)
-    along = jax.lax.map(change, steps.T, batch_size=_AT_ONCE)
-    return jax.tree.map(lambda block: jnp.moveaxis(block, 0, -1), along)
+def _along(problem: Problem, x, steps: Float[np.ndarray, "n k"]) -> Residuals:
+    """Change of all residuals along each of some steps, packet by packet of their Jacobian."""
+    padded = np.concatenate([steps, np.zeros((1, steps.shape[1]))])
+    changes = []
+    for table, packets in zip(problem.linearised(x), problem.packets, strict=True):
+        rows, jacobian = np.asarray(packets.rows), np.asarray(table.jacobian)
+        n, components, live = jacobian.shape
+        change = np.zeros((n + 1, components, steps.shape[1]))
+        for own, columns in zip(rows, np.asarray(packets.columns), strict=True):
+            block = jacobian[own[own < n]].reshape(-1, live) @ padded[columns]
+            change[own[own < n]] = block.reshape(-1, components, steps.shape[1])
+        changes.append(change[:n])
+    return problem.network.residuals(changes)
 
 
 def pose_covariances(
