@@ -383,6 +383,22 @@ def test_blocks_are_the_whole_table(exact):
         live = tuple(range(n_own + network.effects.n_columns))
         apart = linearised(factor, network, flat, live, True)
         whole = eqx.filter_jit(linearised)(factor, network, flat, live, True)
+        used = np.asarray(factor.weight) > 0.0
         for a, b in zip(apart, whole, strict=True):
             assert a.shape == b.shape
-            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(a[used], b[used], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("port", ["", "sensor.focal", "target.disc"])
+def test_blocks_leave_out_what_nothing_feeds(exact, port):
+    """One program under `jit` computes all ports and all rows; blocks only what counts."""
+    _, scene = exact
+    effects = (Effect("one", (Term(port),), amplitudes=(1e-3,)),) if port else ()
+    scene = scene.with_effects(effects, (8, 3))
+    kept = jnp.arange(len(scene.network.pixels[0].weight)) % 3 > 0
+    weight = scene.network.pixels[0].weight * kept
+    network = eqx.tree_at(lambda n: n.pixels[0].weight, scene.network, weight)
+    apart = residual(scene.state, network)
+    whole = eqx.filter_jit(residual)(scene.state, network)
+    for a, b in zip(jax.tree.leaves(apart), jax.tree.leaves(whole), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)

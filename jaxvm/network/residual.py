@@ -29,7 +29,7 @@ from jaxvm.network.state import Layout, State
 from jaxvm.network.tiles import Tiles
 from jaxvm.physics.blocks import by_blocks, hosted, roomy, whole
 from jaxvm.physics.effects import Channels, EffectTable, course_slopes, courses
-from jaxvm.physics.ports import N_PORTS, PortValues
+from jaxvm.physics.ports import DEAR, N_PORTS, PORT_INDEX, PortValues
 
 
 class Network(eqx.Module):
@@ -89,7 +89,8 @@ def residual(state: State, network: Network) -> Residuals:
     def whitened(factor: Factor) -> Array:
         # What is set aside counts nothing, even where it can't be predicted at all.
         used = factor.weight[:, None] > 0.0
-        return jnp.where(used, rows(factor, network, at), 0.0) * whitening(factor)
+        value = rows(factor, network, at, _used(factor))
+        return jnp.where(used, value, 0.0) * whitening(factor)
 
     return network.residuals([whitened(factor) for factor in network.factors()])
 
@@ -135,12 +136,23 @@ def _rotations(turns):
     return jax.vmap(so3_exp)(turns), jax.vmap(so3_left_jacobian)(turns)
 
 
-def rows(factor: Factor, network: Network, at: Present) -> Float[Array, "observations components"]:
-    """Predicted minus measured of one table, in its unit."""
-    return _chained(_values, factor, at, _ports(factor, _acting(network, at)))
+def rows(
+    factor: Factor, network: Network, at: Present, only: np.ndarray | None = None
+) -> Float[Array, "observations components"]:
+    """Predicted minus measured of one table, in its unit; of some rows `only`, if so wanted."""
+    fed = _fed(factor, network)
+    ports = None
+    if fed.any and isinstance(factor, PixelFactor | RangeFactor):
+        ports = _ports(factor, _acting(network, at), only)
+    return _chained(partial(_values, dear=fed.dear), factor, at, ports, only)
 
 
-def _chained(function, factor: Factor, at: Present, ports):
+def _used(factor: Factor) -> np.ndarray | None:
+    """Rows with weight; None where they are not known before the table is computed."""
+    return None if whole(factor.weight) else np.flatnonzero(np.asarray(factor.weight))
+
+
+def _chained(function, factor: Factor, at: Present, ports, only):
     """A function of a table, the flat state and the port values of each row, block by block.
 
     It knows nothing of effects, so their number changes no program of the chain. Where the table is
@@ -153,12 +165,31 @@ def _chained(function, factor: Factor, at: Present, ports):
         return function(factor, shared, None)
     ports = np.zeros((n, 0)) if ports is None else ports
     table = factor.untiled(), ports
-    return by_blocks(partial(_apart, function), table, tuple(map(roomy, shared)))
+    return by_blocks(partial(_apart, function), table, tuple(map(roomy, shared)), only=only)
 
 
 def _apart(function, table, shared):
     factor, ports = table
     return function(factor, shared, ports if ports.shape[1] else None)
+
+
+class Fed(NamedTuple):
+    """Whether effects may act on a table at all, and through the dear port."""
+
+    any: bool
+    dear: bool
+
+
+def _fed(factor: Factor, network: Network) -> Fed:
+    """As far as it is known before anything is computed: mere room for effects costs nothing."""
+    ports = network.effects.ports
+    if not isinstance(factor, PixelFactor | RangeFactor):
+        return Fed(False, False)
+    if whole(ports):
+        return Fed(ports.shape[0] > 0, ports.shape[0] > 0 and isinstance(factor, PixelFactor))
+    ports = np.asarray(ports)
+    dear = ports[:, PORT_INDEX[DEAR]].any() and isinstance(factor, PixelFactor)
+    return Fed(bool(ports.any()), bool(dear))
 
 
 class Acting(NamedTuple):
@@ -245,9 +276,9 @@ def _by_numbers(function, factor: Factor, shared, ports) -> Any:
 
 
 @eqx.filter_jit
-def _values(factor: Factor, shared, ports) -> Float[Array, "observations components"]:
+def _values(factor: Factor, shared, ports, dear: bool) -> Float[Array, "observations components"]:
     def local(own, ports, data):
-        return factor.local(list(map(_still, own)), data, PortValues(ports))
+        return factor.local(list(map(_still, own)), data, PortValues(ports, dear))
 
     return _by_rows(local, factor, shared, ports)
 
@@ -256,11 +287,11 @@ def _still(part):
     return part.pose if isinstance(part, _Pose) else part
 
 
-def _ports(factor: Factor, acting: Acting) -> Float[Array, "observations ports"] | None:
-    """Port values of each observation: what all effects together do to it; None without effects."""
-    if not (isinstance(factor, PixelFactor | RangeFactor) and len(acting.amplitude)):
-        return None
-    return by_blocks(_port_values, (factor.view, factor.pattern), acting)
+def _ports(
+    factor: PixelFactor | RangeFactor, acting: Acting, only: np.ndarray | None
+) -> Float[Array, "observations ports"]:
+    """Port values of each observation: what all effects together do to it."""
+    return by_blocks(_port_values, (factor.view, factor.pattern), acting, only=only)
 
 
 @jax.jit
@@ -292,21 +323,26 @@ def linearise(
     the tangent is computed when it is asked for, else it is empty.
     """
     layout, n_own = network.layout, factor.slots.shape[1]
-    acting = _acting(network, at)
-    ports = _ports(factor, acting)
-    affected = ports is not None
-    if tangent and not affected and isinstance(factor, PixelFactor | RangeFactor):
-        ports = np.zeros((factor.slots.shape[0], N_PORTS))
+    acting, fed, only = _acting(network, at), _fed(factor, network), _used(factor)
+    ports, dear = None, fed.dear
+    if isinstance(factor, PixelFactor | RangeFactor):
+        if fed.any:
+            ports = _ports(factor, acting, only)
+        elif tangent:
+            ports = np.zeros((factor.slots.shape[0], N_PORTS))
+        dear = dear or (tangent and isinstance(factor, PixelFactor))
     own = tuple(at for at in live if at < n_own)
-    value, by_own, by_ports = _chained(partial(_derivatives, live=own), factor, at, ports)
+    derivatives = partial(_derivatives, live=own, dear=dear)
+    value, by_own, by_ports = _chained(derivatives, factor, at, ports, only)
     wanted = tuple(at - n_own for at in live if at >= n_own)
-    if not affected or not wanted:
+    if not fed.any or not wanted:
         by_effects = jnp.zeros((*value.shape, len(wanted)))
     else:
         assert isinstance(factor, PixelFactor | RangeFactor)
         owner = _owners(network.effects, len(layout.all("constant")))
         table = (by_ports, factor.view, factor.pattern)
-        by_effects = by_blocks(_by_effects, table, acting, roomy(at.slopes, axis=1), owner)
+        slopes = roomy(at.slopes, axis=1)
+        by_effects = by_blocks(_by_effects, table, acting, slopes, owner, only=only)
         by_effects = by_effects[:, :, np.asarray(wanted)]
     joined: Any = np if isinstance(by_own, np.ndarray) else jnp
     return Linearised(value, joined.concatenate([by_own, by_effects], axis=2), by_ports)
@@ -334,15 +370,15 @@ def _by_effects(table, acting: Acting, slopes, owner):
 
 
 @eqx.filter_jit
-def _derivatives(factor: Factor, shared, ports, live: tuple[int, ...]):
+def _derivatives(factor: Factor, shared, ports, live: tuple[int, ...], dear: bool):
     """Values of the rows, and their derivatives by live slots of their own and by all ports."""
     if not live and ports is None:
-        value = _values(factor, shared, None)
+        value = _values(factor, shared, None, dear=False)
         return value, *(2 * (jnp.zeros((*value.shape, 0)),))
-    return _by_rows(_derivatives_of_row(factor, live), factor, shared, ports)
+    return _by_rows(_derivatives_of_row(factor, live, dear), factor, shared, ports)
 
 
-def _derivatives_of_row(factor: Factor, live: tuple[int, ...]):
+def _derivatives_of_row(factor: Factor, live: tuple[int, ...], dear: bool = False):
     """Function of one row: its value, and its derivatives by live slots of its own and by ports."""
     ends = np.cumsum(factor.widths)
     first = np.concatenate([[0], ends])[:-1]
@@ -356,7 +392,7 @@ def _derivatives_of_row(factor: Factor, live: tuple[int, ...]):
         for k, change in zip(moving, free, strict=True):
             part = parts[k]
             own[k] = part.changed(change) if isinstance(part, _Pose) else part + change
-        value = factor.local(own, data, PortValues(ports))
+        value = factor.local(own, data, PortValues(ports, dear))
         return value, value
 
     def row(parts, ports, data):

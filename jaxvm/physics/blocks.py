@@ -31,7 +31,9 @@ def hosted(*arrays) -> Any:
     return arrays if whole(arrays) else tuple(np.asarray(array) for array in arrays)
 
 
-def by_blocks(function: Callable, table, *common, size: int | None = None) -> Any:
+def by_blocks(
+    function: Callable, table, *common, size: int | None = None, only: np.ndarray | None = None
+) -> Any:
     """`function(table, *common)`, computed block by block of the table's rows.
 
     Args:
@@ -39,6 +41,7 @@ def by_blocks(function: Callable, table, *common, size: int | None = None) -> An
         table: PyTree whose leaves lead with the rows; scalars go along unchanged.
         common: what all rows share.
         size: rows of a block; by default `BLOCK`, less for a small table.
+        only: rows that are wanted, in order; the others are zero where blocks are computed.
     """
     if whole(table, common):
         return function(table, *common)
@@ -46,18 +49,31 @@ def by_blocks(function: Callable, table, *common, size: int | None = None) -> An
     leaves = [np.asarray(leaf) for leaf in leaves]
     n = max(len(leaf) for leaf in leaves if leaf.ndim)
     size = size or (_SMALL if n <= _SMALL else BLOCK)
+    only = None if only is None or len(only) == n else only
+    wanted = n if only is None else len(only)
     found = []
-    for start in range(0, n, size):
-        block = [_cut(leaf, start, size) if leaf.ndim else leaf for leaf in leaves]
+    # Without any row the shape of the result is that of a block.
+    for start in range(0, max(wanted, 1), size):
+        block = [_cut(leaf, start, size, only) if leaf.ndim else leaf for leaf in leaves]
         found.append(function(jax.tree.unflatten(structure, block), *common))
-    return jax.tree.map(lambda *parts: np.concatenate(parts)[:n], *found)
+
+    def joined(*parts):
+        values = np.concatenate(parts)[:wanted]
+        if only is None:
+            return values
+        everywhere = np.zeros((n, *values.shape[1:]), values.dtype)
+        everywhere[only] = values
+        return everywhere
+
+    return jax.tree.map(joined, *found)
 
 
-def _cut(leaf: np.ndarray, start: int, size: int) -> np.ndarray:
+def _cut(leaf: np.ndarray, start: int, size: int, only: np.ndarray | None) -> np.ndarray:
     """Rows of a block; the last row again where the table ends."""
-    if start + size <= len(leaf):
+    if only is None and start + size <= len(leaf):
         return leaf[start : start + size]
-    return leaf[np.minimum(np.arange(start, start + size), len(leaf) - 1)]
+    rows = np.arange(len(leaf)) if only is None or not len(only) else only
+    return leaf[rows[np.minimum(np.arange(start, start + size), len(rows) - 1)]]
 
 
 def rounded(n: int) -> int:

@@ -319,12 +319,15 @@ def predict_pixel(
         return image(family, distortion, refract(point, curvature, ports), ports)
 
     shown = sight.distortion, camera_from_world(layers(up, ports))
+    image_point = image_of(camera, *shown, ports)
+    if not ports.dear:
+        return expose(sight.focal, sight.centre, image_point, ports)
     plate = jnp.stack([camera_from_world(carrier.rotate(own.rotate(a))) for a in jnp.eye(3)[:2]], 1)
     # What the size of a mark does changes with poses and lenses by its square alone: third
     # derivatives of the image would make every fit twice as dear.
     still, middle, arms = jax.lax.stop_gradient((shown, camera, plate))
     off = off_centre_of_disc(lambda p: image_of(p, *still, ports.held()), middle, arms)
-    image_point = image_of(camera, *shown, ports) + 0.25 * ports["target.disc"] * off
+    image_point = image_point + 0.25 * ports["target.disc"] * off
     return expose(sight.focal, sight.centre, image_point, ports)
 
 

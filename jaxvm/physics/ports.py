@@ -145,15 +145,23 @@ PORT_INDEX: dict[str, int] = {port.name: index for index, port in enumerate(PORT
 N_PORTS = len(PORTS)
 
 
+DEAR = "target.disc"
+"""The port that takes as long as all others together: the chain leaves it out where nothing feeds
+it."""
+
+
 class PortValues:
     """Read a vector of port values by name; without a vector every port is exactly zero.
+
+    `dear` tells whether the port `DEAR` may be other than zero.
 
     The vector is split once, by one operation whose transpose is one concatenation; slicing it port
     by port would cost a padded sum for each in reverse mode.
     """
 
-    def __init__(self, values: Float[Array, " ports"] | None = None):
+    def __init__(self, values: Float[Array, " ports"] | None = None, dear: bool = True):
         self.plain = values is None
+        self.dear = dear and not self.plain
         if values is not None:
             self._values = [part[0] for part in jax.lax.split(values, (1,) * N_PORTS)]
 
@@ -161,7 +169,8 @@ class PortValues:
         """The same values, which are not differentiated."""
         held = PortValues()
         if not self.plain:
-            held.plain, held._values = False, jax.lax.stop_gradient(self._values)
+            held.plain, held.dear = False, self.dear
+            held._values = jax.lax.stop_gradient(self._values)
         return held
 
     def __getitem__(self, name: str) -> Float[Array, ""] | float:
