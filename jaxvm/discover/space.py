@@ -214,17 +214,23 @@ def _as_named(
     # At the ends of a recording a step is a constant, which a map without a name explains.
     steps = [place for place, course in enumerate(courses) if course.form == "step"]
     within = steps[len(steps) // 8 : len(steps) - len(steps) // 8]
+    asked = [(course.driver, course.form) for course in courses]
     together: dict[tuple, list[Group]] = {}
     for group in [*groups, *every_port()]:
         entries = [e for e in CATALOGUE if group.terms in e.groups and e.entity == group.entity]
+        taken = {
+            (driver, form)
+            for driver, form in set(asked)
+            if any(entry.takes(kinds[driver], form) for entry in entries)
+        }
         special = is_special(group)
         many = len(group.terms) > FREE
         own = tuple(
             place
             for place, course in enumerate(courses)
-            if not (many and course.form == "step" and place not in within)
+            if asked[place] in taken
+            and not (many and course.form == "step" and place not in within)
             and (course.form in NAMED_ONLY or (special and (place or group not in listed)))
-            and any(entry.takes(kinds[course.driver], course.form) for entry in entries)
         )
         for n in (1, 2, 3):
             of_size = tuple(k for k in own if len(FORMS[courses[k].form].bases) == n)
@@ -264,8 +270,9 @@ def _views(scene: Scene) -> list[Scope]:
     """Targets as single cameras see them."""
     cameras, targets = scene.model.cameras, scene.model.targets
     obs = scene.recording.observations
-    seen = np.unique(np.stack([obs.target, obs.camera], axis=1), axis=0)
-    return [Scope(camera=(cameras[c].name,), target=(targets[t].name,)) for t, c in seen]
+    seen = np.flatnonzero(np.bincount(obs.target * len(cameras) + obs.camera))
+    pairs = (divmod(int(view), len(cameras)) for view in seen)
+    return [Scope(camera=(cameras[c].name,), target=(targets[t].name,)) for t, c in pairs]
 
 
 def _faces(scene: Scene) -> set[Scope]:

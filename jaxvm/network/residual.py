@@ -324,16 +324,17 @@ def linearise(
     """
     layout, n_own = network.layout, factor.slots.shape[1]
     acting, fed, only = _acting(network, at), _fed(factor, network), _used(factor)
-    ports, dear = None, fed.dear
+    ports = None
     if isinstance(factor, PixelFactor | RangeFactor):
         if fed.any:
             ports = _ports(factor, acting, only)
         elif tangent:
             ports = np.zeros((factor.slots.shape[0], N_PORTS))
-        dear = dear or (tangent and isinstance(factor, PixelFactor))
     own = tuple(at for at in live if at < n_own)
-    derivatives = partial(_derivatives, live=own, dear=dear)
+    derivatives = partial(_derivatives, live=own, dear=fed.dear)
     value, by_own, by_ports = _chained(derivatives, factor, at, ports, only)
+    if tangent and isinstance(factor, PixelFactor) and not fed.dear:
+        by_ports = _with_dear(factor, at, ports, only, value, by_ports)
     wanted = tuple(at - n_own for at in live if at >= n_own)
     if not fed.any or not wanted:
         by_effects = jnp.zeros((*value.shape, len(wanted)))
@@ -346,6 +347,17 @@ def linearise(
         by_effects = by_effects[:, :, np.asarray(wanted)]
     joined: Any = np if isinstance(by_own, np.ndarray) else jnp
     return Linearised(value, joined.concatenate([by_own, by_effects], axis=2), by_ports)
+
+
+def _with_dear(factor: Factor, at: Present, ports, only, value, by_ports) -> Any:
+    """Derivatives by ports with that by the dear one, of which the prediction is a linear function.
+
+    A prediction with it takes a third as long as all derivatives with it.
+    """
+    unit = np.zeros((1, N_PORTS))
+    unit[0, PORT_INDEX[DEAR]] = 1.0
+    fed = _chained(partial(_values, dear=True), factor, at, ports + unit, only)
+    return by_ports + (fed - value)[:, :, None] * unit
 
 
 def _owners(effects: EffectTable, n: int) -> Float[Array, "columns 2 constants"]:
