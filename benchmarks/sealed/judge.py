@@ -135,6 +135,8 @@ def _effect(
     rivals = [name for name, same in alike.items() if name and not same]
     own_names = [name for name, same in alike.items() if same]
     gaps = {name: power["expected_drop"] - power["drops"][name] for name in rivals}
+    own_drop = max((power["drops"][name] for name in own_names), default=0.0)
+    ahead = own_drop - max((power["drops"][name] for name in rivals), default=0.0)
     own_best = max((power["evidence"][name] for name in own_names), default=-np.inf)
     priced = own_best - max((power["evidence"][name] for name in rivals), default=-1e300)
     nearest = min(gaps, key=gaps.__getitem__, default="")
@@ -147,13 +149,13 @@ def _effect(
         "expected_drop": power["expected_drop"],
         "seen": power["seen"],
         "rms_px": power["rms_px"],
-        "own_share": max((power["drops"][name] for name in own_names), default=0.0)
-        / max(power["expected_drop"], 1e-300),
+        "own_share": own_drop / max(power["expected_drop"], 1e-300),
         "wrongly_first": _wrongly_first(found, alike, power["drops"]),
         "nearest": nearest,
         "gap": gaps.get(nearest),
         "shown": is_shown,
         "decidable": is_shown and all(gap >= DECIDED for gap in gaps.values()),
+        "decidable_by_names": is_shown and bool(ahead >= DECIDED),
         "decidable_priced": is_shown and bool(priced >= DECIDED),
         "detected": bool(found),
         "in_set": any(any(own) for own in right),

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 from judge import SHOWN, covered
+from scipy.special import ndtr
 
 FLOOR_RATIO = 1.03
 EXCESS = 0.75
@@ -61,6 +62,25 @@ def _share(number: str, question: str, hits: list[bool], low: float, high: float
     return Figure(number, question, k / n, wilson(k, n), n, target, met)
 
 
+def _odds_of_noise(gap: float | None) -> float:
+    """Probability that the right one of two hypotheses fits better, by the gap between them.
+
+    The difference of their chi-squares is normal, with the gap as its mean and twice the root of
+    the gap as its standard deviation. Who holds both for equally likely can't do better.
+    """
+    return 1.0 if gap is None else float(ndtr(0.5 * np.sqrt(gap)))
+
+
+def _mean(number: str, question: str, values: list[float]) -> Figure:
+    if not values:
+        return Figure(number, question, None, None, 0, "", None)
+    picks = np.random.default_rng(0).choice(values, (2000, len(values)))
+    low, high = np.quantile(picks.mean(axis=1), [0.025, 0.975])
+    return Figure(
+        number, question, float(np.mean(values)), (float(low), float(high)), len(values), "", None
+    )
+
+
 def _level(number: str, question: str, values, q: float, target: str, most=None, unit="") -> Figure:
     values = [v for v in values if v is not None]
     if not values:
@@ -107,9 +127,17 @@ def figures(rows: list[dict]) -> list[Figure]:
             "2", "named first where decidable", [e["first"] for _, e in ones if e["decidable"]],
             0.95,
         ),
+        _mean(
+            "2a", "the most that can be expected of 2: noise may turn the nearest rival",
+            [_odds_of_noise(e["gap"]) for _, e in ones if e["decidable"]],
+        ),
         _share(
             "2b", "the same where decidable with a price of ln n for each unknown",
             [e["first"] for _, e in ones if e["decidable_priced"]], 0.0,
+        ),
+        _share(
+            "2c", "the same (2) where the right name gives so much more than any other",
+            [e["first"] for _, e in ones if e["decidable_by_names"]], 0.0,
         ),
         _level("3a", "size of the set (names), median", sizes, 0.5, "at most 2", 2.0),
         _level("3b", "size of the set, 90th percentile", sizes, 0.9, "at most 5", 5.0),
