@@ -62,7 +62,7 @@ def _share(number: str, question: str, hits: list[bool], low: float, high: float
     return Figure(number, question, k / n, wilson(k, n), n, target, met)
 
 
-def _odds_of_noise(gap: float | None) -> float:
+def odds_of_noise(gap: float | None) -> float:
     """Probability that the right one of two hypotheses fits better, by the gap between them.
 
     The difference of their chi-squares is normal, with the gap as its mean and twice the root of
@@ -129,7 +129,7 @@ def figures(rows: list[dict]) -> list[Figure]:
         ),
         _mean(
             "2a", "the most that can be expected of 2: noise may turn the nearest rival",
-            [_odds_of_noise(e["gap"]) for _, e in ones if e["decidable"]],
+            [odds_of_noise(e["gap"]) for _, e in ones if e["decidable"]],
         ),
         _share(
             "2b", "the same where decidable with a price of ln n for each unknown",

@@ -9,7 +9,7 @@ from judge import _sizes, claims, covered, judge
 from names import Facts, same_name, same_place
 from power import facts_of, plain_fit, shown, whitened
 from scipy.integrate import solve_ivp
-from tally import wilson
+from tally import odds_of_noise, wilson
 from world import heat
 
 from jaxvm.discover.cells import arrange
@@ -113,6 +113,24 @@ def test_wilson():
     # Newcombe 1998, table I: 81 of 263.
     assert wilson(81, 263) == pytest.approx((0.2553, 0.3662), abs=1e-4)
     assert wilson(0, 0) == (0.0, 1.0)
+
+
+def test_what_noise_leaves_to_the_right_one_of_two():
+    rng = np.random.default_rng(0)
+    for gap in (1.0, 6.0, 20.0):
+        # The other hypothesis is off by a vector of length sqrt(gap), in white noise.
+        noise, other = rng.normal(size=(20_000, 3)), np.array([np.sqrt(gap), 0.0, 0.0])
+        right = np.sum(noise**2, axis=1) < np.sum((noise - other) ** 2, axis=1)
+        assert np.mean(right) == pytest.approx(odds_of_noise(gap), abs=0.01)
+
+
+@pytest.mark.parametrize(("rival", "decided"), [(380.0, True), (393.5, False)])
+def test_names_of_one_hypothesis_decide_nothing(rival, decided):
+    drops = {"mount-slip": 394.0, "tripod-settles": rival}
+    power = SHOWN["effects"][0] | {"drops": drops, "evidence": drops}
+    rows = ROWS | {"tripod-settles": (34,)}
+    (effect,) = judge(ENTRY, REPORT, SHOWN | {"effects": [power]}, rows.get)["effects"]
+    assert effect["decidable"] and effect["decidable_by_names"] is decided
 
 
 HIDDEN = {

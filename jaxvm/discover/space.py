@@ -215,12 +215,13 @@ def _as_named(
     steps = [place for place, course in enumerate(courses) if course.form == "step"]
     within = steps[len(steps) // 8 : len(steps) - len(steps) // 8]
     asked = [(course.driver, course.form) for course in courses]
+    distinct = set(asked)
     together: dict[tuple, list[Group]] = {}
     for group in [*groups, *every_port()]:
         entries = [e for e in CATALOGUE if group.terms in e.groups and e.entity == group.entity]
         taken = {
             (driver, form)
-            for driver, form in set(asked)
+            for driver, form in distinct
             if any(entry.takes(kinds[driver], form) for entry in entries)
         }
         special = is_special(group)
