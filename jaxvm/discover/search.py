@@ -93,7 +93,9 @@ class Search:
         """Search until nothing significant is left, at most so many findings are made."""
         plain, heldout = self.current, self.heldout
         first = self._search(most, progress)
-        if worth_a_second_thought(self.findings):
+        # What noise with a memory explains needs no other pair.
+        confirmed = any(finding.p_value <= self.alpha for finding in self.findings)
+        if confirmed and worth_a_second_thought(self.findings):
             progress("trying pairs of other effects")
             others = other_beginnings(first, plain, self.findings[0].hypothesis, self.parts.n)
             pair = better_pair(plain, self.current, self.findings, others, self._tests, self.parts)

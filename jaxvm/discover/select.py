@@ -35,7 +35,7 @@ CLEAR = 15.0
 SOUGHT = ("step", "staircase", "hysteresis", "hysteresis with state")
 """Forms that are asked at few constants and gain most by better ones: no tangent leads there."""
 
-_RTOL, _MAX_STEPS = 1e-6, 14
+_RTOL, _MAX_STEPS = 1e-6, 10
 
 _WIDE = 3.0
 """Prior standard deviation of the amplitudes of a free form, over their median size."""
@@ -209,12 +209,14 @@ def refit(base: Adjustment, hypothesis: Hypothesis, amplitudes, split: Split) ->
         scene = _with_spread(scene, min(middles)) if middles else scene
         own = np.asarray(fit(scene).scene.fitted_effects()[-1].amplitudes)
         scene = _with_spread(scene, float(np.median(np.abs(own))))
-    fitted = fit(scene)
-    effect = fitted.scene.fitted_effects()[-1]
-    if effect.constants and not (fitted.converged and sensible(scene, effect)):
+    fitted = fit(scene, constants_held(scene))
+    if fitted.scene.fitted_effects()[-1].constants and not fitted.failed:
+        # At amplitude zero nothing shows what a constant does: it is freed at the amplitudes.
+        freed = fit(fitted.scene)
         # The grid's constants are good enough when a refined one runs away.
-        fitted = fit(scene, constants_held(scene))
-        effect = fitted.scene.fitted_effects()[-1]
+        if not freed.failed and sensible(scene, freed.scene.fitted_effects()[-1]):
+            fitted = freed
+    effect = fitted.scene.fitted_effects()[-1]
     if fitted.failed:
         return None
     variance = fitted.variance_factor

@@ -20,6 +20,9 @@ from jaxvm.solve.problem import Normal, normal_at
 
 _HISTORY = 512
 
+_MOST_CUTS = 2
+"""Rejections in a row after which damping grows no faster."""
+
 _GRANTED, _SLOWEST = 3.0, 0.9
 """What a minimisation may gain beyond what its steps promise, and the slowest rate it is given."""
 
@@ -43,10 +46,17 @@ class _State(eqx.Module):
     history: Float[Array, " steps"]  # accepted cost after each evaluation
 
 
-class Relaxing(optx.ClassicalTrustRegion):
-    """Trust region that starts near Gauss-Newton and opens fast.
+class _Region(eqx.Module):
+    step_size: Float[Array, ""]
+    rejected: Int[Array, ""]  # trials in a row
 
-    Unknowns are scaled to a unit diagonal, so the damping is relative.
+
+class Relaxing(optx.ClassicalTrustRegion):
+    """Trust region that starts near Gauss-Newton, opens fast, and closes faster and faster.
+
+    Unknowns are scaled to a unit diagonal, so the damping is relative. Where trials are rejected in
+    a row, damping grows tenfold, then a hundredfold, then a thousandfold each time (as Nielsen's
+    rule does, 1999): what began near Gauss-Newton is soon where damping matters.
     """
 
     damping: float | Float[Array, ""] = 1e-3
@@ -57,17 +67,24 @@ class Relaxing(optx.ClassicalTrustRegion):
     low_constant: float = 0.1
 
     def init(self, y, f_info_struct):
-        state = super().init(y, f_info_struct)
-        return eqx.tree_at(lambda s: s.step_size, state, 1.0 / jnp.asarray(self.damping))
+        return _Region(1.0 / jnp.asarray(self.damping), jnp.array(0))
+
+    def step(self, first_step, y, y_eval, f_info, f_eval_info, state):
+        before = state.step_size
+        size, accept, result, _ = super().step(first_step, y, y_eval, f_info, f_eval_info, state)
+        again = jnp.minimum(state.rejected, _MOST_CUTS)
+        size = jnp.where(accept, size, before * self.low_constant ** (1.0 + again))
+        return size, accept, result, _Region(size, jnp.where(accept, 0, state.rejected + 1))
 
 
 class NormalEquationSolver(optx.AbstractLeastSquaresSolver):
     """Least squares by normal equations: a descent, a search, and a statistical stopping rule.
 
-    The problem is passed as `args`. It stops when a hardly damped step changes the cost by no more
-    than `rtol` of itself plus `atol`, up or down, or when damping can't find a lower cost any more.
-    The cost is half a chi-square, so a change of `atol` moves no combination of unknowns by more
-    than sqrt(2 atol) of its standard deviation.
+    The problem is passed as `args`. It stops when a hardly damped step changes the cost, or promises
+    to change it, by no more than `rtol` of itself plus `atol`, or when damping can't find a lower
+    cost any more: after a rejection the next step promises no more than that. The cost is half a
+    chi-square, so a change of `atol` moves no combination of unknowns by more than sqrt(2 atol) of
+    its standard deviation. A last step that promises so little is taken unseen.
     """
 
     rtol: float | Float[Array, ""]
@@ -109,7 +126,8 @@ class NormalEquationSolver(optx.AbstractLeastSquaresSolver):
         )
         accept = accept & (jnp.isfinite(info.f) | state.first)
         gained = state.info.f - info.f
-        settled = (jnp.abs(gained) <= self.rtol * info.f + self.atol) & (size >= 1.0)
+        little = self.rtol * info.f + self.atol
+        settled = (jnp.abs(gained) <= little) & (size >= 1.0)
         stuck = ~accept & (size < 1e-12)
         done = ~state.first & (settled | stuck)
 
@@ -123,6 +141,12 @@ class NormalEquationSolver(optx.AbstractLeastSquaresSolver):
         # A damped matrix that is not positive definite gives no step: damp more and try again.
         failed = descent_result != optx.RESULTS.successful
         hopeless = failed & (size < 1e-12)
+        # What the next step promises, by the quadratic model.
+        promised = -jnp.sum(change * (kept.grad + 0.5 * kept.hessian.mv(change)))
+        ends = ~failed & (promised <= self.rtol * kept.f + self.atol)
+        unseen = ends & (size >= 1.0) & ~done
+        y = jnp.where(unseen, y + change, y)
+        done = done | unseen | (ends & ~accept)
         result = optx.RESULTS.where(hopeless, descent_result, search_result)
         state = _State(
             first=jnp.array(False),
