@@ -18,7 +18,7 @@ STRONG = 20.0
 It can't follow the noise of single epochs, and the held-out third alone shows a weak effect badly.
 """
 
-_FREE_LEAST, _FREE_LEAST_OF_EPOCHS = 20.0, 40.0
+_FREE_LEAST, _FREE_LEAST_OF_EPOCHS = 20.0, 30.0
 """Evidence that a free form must promise before it is fitted: with less it follows noise.
 
 One with an amount for every epoch follows whatever comes and goes, in held-out epochs, too.
@@ -54,10 +54,8 @@ def accept(
 
     `hopeless` collects what can't be fitted or does not help there; it is not tried again.
     """
-    # One tangent foretells a drop to a few percent: only near ties of the leading one need a refit.
-    # Where none of them passes, named physics gets its turn; an unnamed effect must lead.
-    least = leading[0][1] - max(_NEAR, _TIE * abs(leading[0][1]))
-    near = [item for item in leading[:_CANDIDATES] if item[1] >= least]
+    # Where none of the near ties passes, named physics gets its turn; an unnamed effect must lead.
+    near = _near_ties(leading)
     rest = [item for item in leading[len(near) :] if item[0].entries]
     tried: list[Candidate] = []
     for some in (near, rest[:_CANDIDATES]):
@@ -89,6 +87,35 @@ def accept(
                 return Accepted(candidate, others, shown, proof, tuple(tried))
             hopeless.add((identity(candidate.hypothesis), candidate.hypothesis.course))
     return short(leading[0][0])
+
+
+def beside(
+    current: Adjustment, chosen: Candidate, foremost, split: Split
+) -> tuple[list[Candidate], list]:
+    """What comes behind a hypothesis that was refitted already: near ties, refitted too, and all.
+
+    Only what has a name and few columns; what led before it is left out.
+
+    Args:
+        current: the fit without it.
+        chosen: the hypothesis.
+        foremost: the leading hypotheses at that fit.
+        split: what is fitted.
+    """
+    named = [item for item in foremost if item[0].entries and len(item[2]) <= FREE]
+    place = next((k for k, item in enumerate(named) if item[0].same(chosen.hypothesis)), None)
+    if place is None:
+        return [], []
+    ties = _near_ties(named[place:])[1:]
+    near = [refit(current, hypothesis, amplitudes, split) for hypothesis, _, amplitudes in ties]
+    best = sorted((c for c in near if c is not None), key=lambda c: -c.evidence)
+    return best, named[place + 1 :]
+
+
+def _near_ties(leading: list) -> list:
+    """The leading hypothesis and those near it: one tangent foretells a drop to a few percent."""
+    least = leading[0][1] - max(_NEAR, _TIE * abs(leading[0][1]))
+    return [item for item in leading[:_CANDIDATES] if item[1] >= least]
 
 
 def _least(hypothesis: Hypothesis) -> float:

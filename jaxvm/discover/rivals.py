@@ -12,10 +12,17 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from jaxvm.discover.courses import Course
-from jaxvm.discover.hypotheses import Family, Hypothesis
+from jaxvm.discover.hypotheses import FREE, Family, Hypothesis
 from jaxvm.discover.ranking import Ranking
 from jaxvm.discover.score import ScoreTests
-from jaxvm.discover.select import DECIDED, decisive_gap, log_prior, price_of_columns, stacked
+from jaxvm.discover.select import (
+    DECIDED,
+    decisive_gap,
+    log_prior,
+    n_shown,
+    price_of_columns,
+    stacked,
+)
 from jaxvm.discover.space import member
 from jaxvm.physics.effects import Effect
 from jaxvm.solve.adjust import Adjustment
@@ -90,7 +97,9 @@ def rivals(
     claims: dict[tuple, _Claim] = {}
     own_amplitudes = np.asarray(effect.amplitudes)
     own_prior = log_prior(own, own_amplitudes)
-    own_columns = price_of_columns(own, len(own_amplitudes), full, n)
+    own_columns = price_of_columns(own, n_shown(own_amplitudes), full, n)
+    # What has fewer columns may be behind by what it saves.
+    saved = own_columns - np.log(n) if len(own_amplitudes) <= FREE else 0.0
 
     def weigh(hypothesis: Hypothesis, amplitudes: np.ndarray, gap: float, fit: float) -> None:
         for named in _one_by_one(hypothesis):
@@ -106,14 +115,15 @@ def rivals(
     for some in (tests, tests.about(refined) if refined else None):
         if some is not None:
             alike = some.score(variance, residual=change)
-            found += list(_resembling(alike, scene, own, full, variance, limit))
+            found += list(_resembling(alike, scene, own, full, variance, limit + saved))
     own_price = min((price for h, _, price, _ in found if h.same(own)), default=0.0)
     prices = {_course_of(h): price for h, _, price, _ in reversed(found)}
     for hypothesis, gap, _, amplitudes in found:
-        if gap <= limit:
-            columns = price_of_columns(hypothesis, len(amplitudes), full - gap, n)
-            cost = columns - own_columns + prices[_course_of(hypothesis)] - own_price
-            weigh(hypothesis, amplitudes, gap, -0.5 * (shrunk * gap + cost))
+        columns = price_of_columns(hypothesis, n_shown(amplitudes), full - gap, n) - own_columns
+        if gap + min(columns, 0.0) <= limit:
+            cost = columns + prices[_course_of(hypothesis)] - own_price
+            behind = shrunk * min(gap, limit) + max(gap - limit, 0.0)
+            weigh(hypothesis, amplitudes, gap, -0.5 * (behind + cost))
     for hypothesis, amplitudes, in_white in shown:
         behind = in_white / noise
         if behind <= limit and not hypothesis.same(own):

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from jaxvm.discover.accept import Accepted, accept, short
+from jaxvm.discover.accept import Accepted, accept, beside, short
 from jaxvm.discover.detail import with_detail
 from jaxvm.discover.diagnosis import Finding
 from jaxvm.discover.finer import at_finer_constants, said, with_slow_beginnings
@@ -235,16 +235,21 @@ class Search:
     def _take_pair(self, pair, progress: Callable[[str], None]) -> None:
         """Take hypotheses that were fitted already, as if each had led, while they are significant.
 
-        What led beside them took parts of both, and is no rival.
+        What led beside them took parts of both, and is no rival; what came close behind is.
         """
         for candidate in pair:
-            self._score()
+            foremost = self._score()
             if self.p_value > self.alpha:
                 return
+            near, behind = beside(self.current, candidate, foremost, self.parts)
             shown = self.parts.evaluate(candidate.adjustment.scene)
             proof = gain(self.heldout, shown, self.seed)
-            leading = [(candidate.hypothesis, candidate.evidence, candidate.amplitudes)]
-            self._take(Accepted(candidate, (), shown, proof, (candidate,)), leading)
+            refitted = (candidate, *near)
+            leading = [(c.hypothesis, c.evidence, c.amplitudes) for c in refitted]
+            leading += [
+                item for item in behind if not any(item[0].same(c.hypothesis) for c in near)
+            ]
+            self._take(Accepted(candidate, tuple(near), shown, proof, refitted), leading)
             progress(f"found: {candidate.effect.name} ({candidate.effect.scope.words()})")
         # The first was fitted without the second.
         deviations = effect_deviations(self.current)[self.given :]
@@ -387,7 +392,8 @@ class Search:
 
         What is left need not be significant among all hypotheses; at the finding's own ports, or in
         its harmonics, it speaks against the course that was named. So does another finding at the
-        same ports of the same body: one course that has no name is easily taken for two. A free
+        same ports of the same body, or with the same driver there, or of every image for itself:
+        one course that has no name is easily taken for two. A free
         form fits what has another name, or none, as well as its own, and what it does not fit quite
         is a smaller finding that has a name.
         """
@@ -398,7 +404,11 @@ class Search:
         shared = any(
             f is not finding
             and f.effect.scope == effect.scope
-            and ports & {term.port for term in f.effect.terms}
+            and (
+                ports & {term.port for term in f.effect.terms}
+                or f.effect.driver == effect.driver != "constant"
+                or any(term.driver == "epoch" for term in f.effect.terms)
+            )
             for f in self.findings
         )
         free = any(

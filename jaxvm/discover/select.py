@@ -115,12 +115,17 @@ def evidence(
     Each constant that is refined costs what the drop lets it be known by (Laplace): next to nothing
     where any value does, as much as a column where one value alone does.
     """
-    drop, columns = drop / variance, len(amplitudes)
+    drop, columns = drop / variance, n_shown(amplitudes)
     own = FORMS[hypothesis.course.form].constants[: len(hypothesis.course.constants)]
     refined = min(np.log1p(_SHARP * max(drop, 0.0)), np.log(n))
     constants = sum(refined if constant.refined else np.log(n) for constant in own)
     prior = log_prior(hypothesis, np.asarray(amplitudes))
     return drop - price_of_columns(hypothesis, columns, drop, n) - constants + 2.0 * prior
+
+
+def n_shown(amplitudes) -> int:
+    """Number of amplitudes that something shows: those of epochs that are set aside stay zero."""
+    return int(np.count_nonzero(amplitudes)) or len(amplitudes)
 
 
 def price(

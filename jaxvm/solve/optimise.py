@@ -66,10 +66,10 @@ class Relaxing(optx.ClassicalTrustRegion):
     high_constant: float = 10.0
     low_constant: float = 0.1
 
-    def init(self, y, f_info_struct):
+    def init(self, y, f_info_struct) -> Any:
         return _Region(1.0 / jnp.asarray(self.damping), jnp.array(0))
 
-    def step(self, first_step, y, y_eval, f_info, f_eval_info, state):
+    def step(self, first_step, y, y_eval, f_info, f_eval_info, state: Any) -> Any:
         before = state.step_size
         size, accept, result, _ = super().step(first_step, y, y_eval, f_info, f_eval_info, state)
         again = jnp.minimum(state.rejected, _MOST_CUTS)
@@ -80,11 +80,11 @@ class Relaxing(optx.ClassicalTrustRegion):
 class NormalEquationSolver(optx.AbstractLeastSquaresSolver):
     """Least squares by normal equations: a descent, a search, and a statistical stopping rule.
 
-    The problem is passed as `args`. It stops when a hardly damped step changes the cost, or promises
-    to change it, by no more than `rtol` of itself plus `atol`, or when damping can't find a lower
-    cost any more: after a rejection the next step promises no more than that. The cost is half a
-    chi-square, so a change of `atol` moves no combination of unknowns by more than sqrt(2 atol) of
-    its standard deviation. A last step that promises so little is taken unseen.
+    The problem is passed as `args`. It stops when a hardly damped step changes the cost, or
+    promises to change it, by no more than `rtol` of itself plus `atol`, or when damping can't find
+    a lower cost any more: after a rejection the next step promises no more than that. The cost is
+    half a chi-square, so a change of `atol` moves no combination of unknowns by more than
+    sqrt(2 atol) of its standard deviation. A last step that promises so little is taken unseen.
     """
 
     rtol: float | Float[Array, ""]
