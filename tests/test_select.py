@@ -12,7 +12,7 @@ from jaxvm.discover.courses import Course
 from jaxvm.discover.diagnose import _plain_fit
 from jaxvm.discover.groups import Group
 from jaxvm.discover.hypotheses import Hypothesis
-from jaxvm.discover.select import best_named, identity, log_prior, refit
+from jaxvm.discover.select import best_named, evidence, identity, log_prior, refit
 from jaxvm.network.residual import predict_pixels
 from jaxvm.physics.catalogue import entries_for
 from jaxvm.physics.catalogue.entry import each
@@ -41,6 +41,19 @@ def test_the_size_decides_between_two_names(per_kelvin, name):
     priors = [log_prior(own, np.array([per_kelvin])) for own in alone]
     assert priors[0] > priors[1]
     assert len({identity(own) for own in alone}) == 2
+
+
+def test_amounts_of_epochs_that_are_set_aside_cost_nothing():
+    many, fewer, drop, n = 60, 40, 130.0, 5000
+    group = Group(each("epoch", "sensor.focal", numbers=range(many)), "camera")
+    hunts = Hypothesis(group, Course("constant", "constant"), Scope(camera=("left",)), ())
+    amounts = np.full(many, 1e-4)
+    aside = np.where(np.arange(many) % 3 == 2, 0.0, amounts)
+    own = [evidence(hunts, drop, amplitudes, 1.0, n) for amplitudes in (aside, amounts)]
+    # Each amount costs 1 + ln(drop / number), as its prior is as wide as they are.
+    price = [k * (1.0 + np.log(drop / k)) for k in (fewer, many)]
+    assert own[0] - own[1] == pytest.approx(price[1] - price[0])
+    assert own[0] > own[1]
 
 
 def unnamed(driver: str, form: str, *ports: str) -> Hypothesis:

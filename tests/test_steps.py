@@ -5,12 +5,14 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
+import optimistix as optx
 import pytest
 from networks import board_recording, free_points_recording, nudged
 from scipy.optimize import least_squares
 
 from jaxvm.solve.adjust import adjust
 from jaxvm.solve.arrow import Arrow, NormalCholesky, factorise
+from jaxvm.solve.optimise import Relaxing
 from jaxvm.solve.problem import normal_at, scaled, scene_problem
 
 NETWORKS = {"epochs": board_recording, "points": free_points_recording}
@@ -189,3 +191,36 @@ def test_both_methods_end_where_scipy_ends(network, reference, method):
     j = dense(jnp.asarray(reference.x), result.problem)[1]
     apart = np.linalg.norm(np.asarray(j) @ (np.asarray(result.x) - reference.x))
     assert apart < 1e-3
+
+
+def test_rejections_in_a_row_damp_faster_and_faster():
+    search = Relaxing(damping=1e-6)
+    operator = lx.MatrixLinearOperator(jnp.eye(1))
+    at = optx.FunctionInfo.EvalGradHessian(jnp.array(1.0), jnp.array([1.0]), operator)
+    y, trial = jnp.zeros(1), jnp.array([-1.0])
+
+    def stepped(state, value):
+        other = optx.FunctionInfo.EvalGradHessian(jnp.array(value), jnp.array([0.0]), operator)
+        size, accepted, _, state = search.step(jnp.array(False), y, trial, at, other, state)
+        return float(size), bool(accepted), state
+
+    state, sizes = search.init(y, None), []
+    for _ in range(5):
+        size, accepted, state = stepped(state, 2.0)
+        assert not accepted
+        sizes.append(size)
+    assert np.allclose(np.log10(sizes), [5, 3, 0, -3, -6])
+    size, accepted, state = stepped(state, 0.5)
+    assert accepted and np.isclose(np.log10(size), -5)
+    # After a step that was taken patience is what it was.
+    assert np.isclose(np.log10(stepped(state, 2.0)[0]), -6)
+
+
+def test_at_a_solution_one_evaluation_does(network):
+    _, scene, *_ = network
+    found = adjust(scene)
+    again = adjust(found.scene)
+    assert again.converged and again.evaluations == 1
+    # Its unknowns are in standard deviations at most.
+    assert np.abs(np.asarray(again.x)).max() < 1e-3
+    assert again.cost == pytest.approx(found.cost, rel=1e-9)

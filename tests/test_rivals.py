@@ -1,0 +1,71 @@
+"""Rivals of a finding: what has fewer columns may be behind by what it saves."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import recorded
+
+from jaxvm.discover.diagnose import ROOM, _plain_fit
+from jaxvm.discover.hypotheses import Hypothesis
+from jaxvm.discover.ranking import top
+from jaxvm.discover.rivals import rivals
+from jaxvm.discover.score import ScoreTests
+from jaxvm.discover.select import decisive_gap, refit
+from jaxvm.discover.space import enumerate_hypotheses
+from jaxvm.network.scene import build
+from jaxvm.network.start import start
+from jaxvm.solve.covariance import effect_deviations
+
+PER_KELVIN = 2.8e-5
+
+
+@pytest.fixture(scope="module")
+def warmed(tmp_path_factory):
+    """A scene with nothing hidden, and what a focal length that follows the air does to it."""
+    _, recording = recorded((), tmp_path_factory.mktemp("warmed"))
+    obs, drivers = recording.observations, recording.drivers
+    warm = np.interp(recording.time, drivers.time, drivers.channels["ambient_degC"])
+    mine = obs.camera == [c.name for c in recording.model.cameras].index("right")
+    reach = np.where(mine[:, None], obs.pixel - recording.model.cameras[1].centre_px, 0.0)
+    return recording, (warm - warm.mean())[obs.epoch][:, None], reach
+
+
+def fitted(warmed, bend: float):
+    """The plain fit, and that with a parabola of the air's temperature."""
+    recording, warm, reach = warmed
+    pixel = recording.observations.pixel + (PER_KELVIN * warm + bend * warm**2) * reach
+    recording = replace(recording, observations=replace(recording.observations, pixel=pixel))
+    scene = start(build(recording, ())).with_effects(recording.model.effects, ROOM)
+    parts, plain, _ = _plain_fit(scene, 3)
+    tests = ScoreTests.of(plain, enumerate_hypotheses(plain.scene))
+    for hypothesis, _, amplitudes in top(tests.score(1.0), plain.scene, 10_000, 2):
+        if is_focal(hypothesis, "quadratic"):
+            return parts, plain, tests, refit(plain, hypothesis, amplitudes, parts)
+    raise AssertionError("no parabola was asked")
+
+
+def is_focal(hypothesis: Hypothesis, form: str) -> bool:
+    ports = [term.port for term in hypothesis.group.terms]
+    course = hypothesis.course.driver, hypothesis.course.form
+    here = hypothesis.scope.camera == ("right",)
+    return ports == ["sensor.focal"] and course == ("ambient_degC", form) and here
+
+
+@pytest.mark.parametrize("deviations, shown", [(3.6, True), (9.0, False)])
+def test_a_line_is_a_rival_of_its_parabola_while_it_saves_more_than_it_loses(
+    warmed, deviations, shown
+):
+    _, _, _, found = fitted(warmed, 0.0)
+    std = effect_deviations(found.adjustment)[-1][1]
+    bend = deviations * std - found.amplitudes[1]
+    parts, plain, tests, found = fitted(warmed, bend)
+    assert found.amplitudes[1] / std == pytest.approx(deviations, rel=0.1)
+    # What the parabola gains over its line is more than any gap that leaves things open...
+    drop = 2.0 * (plain.cost - found.adjustment.cost) / found.adjustment.variance_factor
+    assert deviations**2 > decisive_gap(drop)
+    _, others = rivals(plain, found.adjustment, found.hypothesis, found.effect, tests, parts.n)
+    lines = [r for r in others if is_focal(r.hypothesis, "linear")]
+    # ... but a column costs ln n.
+    assert bool(lines) == shown
+    assert (deviations**2 < decisive_gap(drop) + np.log(parts.n)) == shown
