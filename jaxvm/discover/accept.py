@@ -24,6 +24,9 @@ _FREE_LEAST, _FREE_LEAST_OF_EPOCHS = 20.0, 30.0
 One with an amount for every epoch follows whatever comes and goes, in held-out epochs, too.
 """
 
+_TRIED_AGAIN, _HOPEFUL = 6, 0.75
+"""Leading hypotheses that are tried again in place of a finding; their share of its evidence."""
+
 _TIE = 0.05
 _OPEN = 100.0, 0.02
 
@@ -54,8 +57,10 @@ def accept(
 
     `hopeless` collects what can't be fitted or does not help there; it is not tried again.
     """
-    # Where none of the near ties passes, named physics gets its turn; an unnamed effect must lead.
-    near = _near_ties(leading)
+    # One tangent foretells a drop to a few percent: only near ties of the leading one need a refit.
+    # Where none of them passes, named physics gets its turn; an unnamed effect must lead.
+    least = leading[0][1] - max(_NEAR, _TIE * abs(leading[0][1]))
+    near = [item for item in leading[:_CANDIDATES] if item[1] >= least]
     rest = [item for item in leading[len(near) :] if item[0].entries]
     tried: list[Candidate] = []
     for some in (near, rest[:_CANDIDATES]):
@@ -89,35 +94,6 @@ def accept(
     return short(leading[0][0])
 
 
-def beside(
-    current: Adjustment, chosen: Candidate, foremost, split: Split
-) -> tuple[list[Candidate], list]:
-    """What comes behind a hypothesis that was refitted already: near ties, refitted too, and all.
-
-    Only what has a name and few columns; what led before it is left out.
-
-    Args:
-        current: the fit without it.
-        chosen: the hypothesis.
-        foremost: the leading hypotheses at that fit.
-        split: what is fitted.
-    """
-    named = [item for item in foremost if item[0].entries and len(item[2]) <= FREE]
-    place = next((k for k, item in enumerate(named) if item[0].same(chosen.hypothesis)), None)
-    if place is None:
-        return [], []
-    ties = _near_ties(named[place:])[1:]
-    near = [refit(current, hypothesis, amplitudes, split) for hypothesis, _, amplitudes in ties]
-    best = sorted((c for c in near if c is not None), key=lambda c: -c.evidence)
-    return best, named[place + 1 :]
-
-
-def _near_ties(leading: list) -> list:
-    """The leading hypothesis and those near it: one tangent foretells a drop to a few percent."""
-    least = leading[0][1] - max(_NEAR, _TIE * abs(leading[0][1]))
-    return [item for item in leading[:_CANDIDATES] if item[1] >= least]
-
-
 def _least(hypothesis: Hypothesis) -> float:
     """Evidence that a free form must promise."""
     of_epochs = any(term.driver == "epoch" for term in hypothesis.group.terms)
@@ -130,6 +106,32 @@ def _common_evidence(candidate: Candidate, all_candidates, current: Adjustment) 
     own = candidate.adjustment.variance_factor
     drop = 2.0 * (current.cost - candidate.adjustment.cost)
     return candidate.evidence + drop * (1.0 / variance - 1.0 / own)
+
+
+def alternatives(accepted: Accepted, leading) -> tuple[Hypothesis, ...]:
+    """What was refitted, and what else led with few columns, if it was not far behind."""
+    best = accepted.chosen.evidence
+    tried = [c.hypothesis for c in accepted.tried if c.evidence > _HOPEFUL * best]
+    least = _HOPEFUL * leading[0][1]
+    others = [h for h, own, amplitudes in leading if len(amplitudes) <= FREE and own > least]
+    others = [h for h in others if not any(h.same(one) for one in tried)]
+    return tuple((tried + others)[:_TRIED_AGAIN])
+
+
+def as_good(accepted: Accepted, leading):
+    """What was refitted and fell behind a little, and named ones that one tangent foretells."""
+    chosen = accepted.chosen
+    for other in accepted.near:
+        yield (
+            other.hypothesis,
+            np.asarray(other.effect.amplitudes),
+            chosen.evidence - other.evidence,
+        )
+    refitted = [candidate.hypothesis for candidate in accepted.tried]
+    foretold = [own for h, own, _ in leading if h.same(chosen.hypothesis)]
+    for hypothesis, own, amplitudes in leading if foretold else ():
+        if hypothesis.entries and not any(r.same(hypothesis) for r in refitted):
+            yield hypothesis, amplitudes, max(foretold[0] - own, 0.0)
 
 
 def short(hypothesis: Hypothesis) -> str:

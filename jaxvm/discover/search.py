@@ -5,12 +5,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from jaxvm.discover.accept import Accepted, accept, beside, short
+from jaxvm.discover.accept import Accepted, accept, alternatives, as_good, short
 from jaxvm.discover.detail import with_detail
 from jaxvm.discover.diagnosis import Finding
+from jaxvm.discover.doubt import doubted
 from jaxvm.discover.finer import at_finer_constants, said, with_slow_beginnings
 from jaxvm.discover.heldout import HeldOut, Split, gain
-from jaxvm.discover.hypotheses import FREE, Hypothesis
 from jaxvm.discover.noise import Correlation, Met, met, random_signs
 from jaxvm.discover.pairs import better_pair, other_beginnings, worth_a_second_thought
 from jaxvm.discover.ranking import Ranking, spread_of_constant, surprise
@@ -28,18 +28,6 @@ from jaxvm.solve.snooping import robust_variance
 
 ALPHA = 0.01
 """Family-wise probability to claim something where nothing is hidden."""
-
-DOUBT = 0.1
-"""Weight taken from a name where something speaks against it (`_doubted`): a cautious choice.
-
-It keeps every such name below the 95 % from which a reader may call it sure.
-"""
-
-DOUBTFUL = 0.05
-"""Probability of what is left at a finding's own ports from which its course is doubted."""
-
-_TRIED_AGAIN, _HOPEFUL = 6, 0.75
-"""Leading hypotheses that are tried again in place of a finding; their share of its evidence."""
 
 _WORSE = 1.01
 """Rise of the held-out RMS that other names may bring: what differs less is noise."""
@@ -235,21 +223,16 @@ class Search:
     def _take_pair(self, pair, progress: Callable[[str], None]) -> None:
         """Take hypotheses that were fitted already, as if each had led, while they are significant.
 
-        What led beside them took parts of both, and is no rival; what came close behind is.
+        What led beside them took parts of both, and is no rival.
         """
         for candidate in pair:
-            foremost = self._score()
+            self._score()
             if self.p_value > self.alpha:
                 return
-            near, behind = beside(self.current, candidate, foremost, self.parts)
             shown = self.parts.evaluate(candidate.adjustment.scene)
             proof = gain(self.heldout, shown, self.seed)
-            refitted = (candidate, *near)
-            leading = [(c.hypothesis, c.evidence, c.amplitudes) for c in refitted]
-            leading += [
-                item for item in behind if not any(item[0].same(c.hypothesis) for c in near)
-            ]
-            self._take(Accepted(candidate, tuple(near), shown, proof, refitted), leading)
+            leading = [(candidate.hypothesis, candidate.evidence, candidate.amplitudes)]
+            self._take(Accepted(candidate, (), shown, proof, (candidate,)), leading)
             progress(f"found: {candidate.effect.name} ({candidate.effect.scope.words()})")
         # The first was fitted without the second.
         deviations = effect_deviations(self.current)[self.given :]
@@ -268,7 +251,7 @@ class Search:
             chosen.effect,
             self._tests,
             parts.n,
-            _as_good(accepted, leading),
+            as_good(accepted, leading),
         )
         return Finding(
             hypothesis=chosen.hypothesis,
@@ -289,7 +272,7 @@ class Search:
             gain=accepted.gain,
             ranking=tuple((short(h), e) for h, e, _ in leading),
             doubles=tuple(candidate.hypothesis for candidate in accepted.near),
-            alternatives=_alternatives(accepted, leading),
+            alternatives=alternatives(accepted, leading),
             chosen=next(k for k, (h, *_) in enumerate(leading) if h.same(chosen.hypothesis)),
         )
 
@@ -368,7 +351,8 @@ class Search:
         if self.current is not before:
             self._score()
             self.unproven = self.unproven if self.p_value <= self.alpha else ""
-        self.findings = [self._doubted(finding) for finding in self.findings]
+        significant = self.p_value <= self.alpha
+        self.findings = doubted(self.findings, self.ranking, significant)
 
     def _rename(self) -> None:
         """Better names beside all the others."""
@@ -386,39 +370,6 @@ class Search:
         shown = self.parts.evaluate(current.scene)
         if shown.rms_px <= _WORSE * self.heldout.rms_px:
             self.current, self.findings = current, findings
-
-    def _doubted(self, finding: Finding) -> Finding:
-        """A finding's weights where something is left: it may be that of which this is a part.
-
-        What is left need not be significant among all hypotheses; at the finding's own ports, or in
-        its harmonics, it speaks against the course that was named. So does another finding at the
-        same ports of the same body, or with the same driver there, or of every image for itself:
-        one course that has no name is easily taken for two. A free
-        form fits what has another name, or none, as well as its own, and what it does not fit quite
-        is a smaller finding that has a name.
-        """
-        effect = finding.effect
-        ports = {term.port for term in effect.terms}
-        left = self.ranking.left_at(ports, effect.scope)
-        left = min(left, self.ranking.left_in_harmonics(effect))
-        shared = any(
-            f is not finding
-            and f.effect.scope == effect.scope
-            and (
-                ports & {term.port for term in f.effect.terms}
-                or f.effect.driver == effect.driver != "constant"
-                or any(term.driver == "epoch" for term in f.effect.terms)
-            )
-            for f in self.findings
-        )
-        free = any(
-            len(f.effect.amplitudes) > FREE and f.drop >= finding.drop for f in self.findings
-        )
-        if self.p_value > self.alpha and left > DOUBTFUL and not shared and not free:
-            return finding
-        sure = 1.0 - DOUBT
-        others = tuple(replace(r, weight=sure * r.weight) for r in finding.rivals)
-        return replace(finding, weight=sure * finding.weight, rivals=others)
 
     def _weighed_again(self, k: int) -> Finding:
         """A finding among its rivals with all the others in the model, and with those it had."""
@@ -449,29 +400,3 @@ class Search:
         scene = self.current.scene
         self.current = self.parts.fit(scene.with_effects(effects, scene.room))
         self.findings = [self.findings[k] for k in kept]
-
-
-def _alternatives(accepted: Accepted, leading) -> tuple[Hypothesis, ...]:
-    """What was refitted, and what else led with few columns, if it was not far behind."""
-    best = accepted.chosen.evidence
-    tried = [c.hypothesis for c in accepted.tried if c.evidence > _HOPEFUL * best]
-    least = _HOPEFUL * leading[0][1]
-    others = [h for h, own, amplitudes in leading if len(amplitudes) <= FREE and own > least]
-    others = [h for h in others if not any(h.same(one) for one in tried)]
-    return tuple((tried + others)[:_TRIED_AGAIN])
-
-
-def _as_good(accepted: Accepted, leading):
-    """What was refitted and fell behind a little, and named ones that one tangent foretells."""
-    chosen = accepted.chosen
-    for other in accepted.near:
-        yield (
-            other.hypothesis,
-            np.asarray(other.effect.amplitudes),
-            chosen.evidence - other.evidence,
-        )
-    refitted = [candidate.hypothesis for candidate in accepted.tried]
-    foretold = [own for h, own, _ in leading if h.same(chosen.hypothesis)]
-    for hypothesis, own, amplitudes in leading if foretold else ():
-        if hypothesis.entries and not any(r.same(hypothesis) for r in refitted):
-            yield hypothesis, amplitudes, max(foretold[0] - own, 0.0)
