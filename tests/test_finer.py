@@ -7,7 +7,7 @@ import pytest
 from networks import board_recording
 
 from jaxvm.discover import courses
-from jaxvm.discover.constants import other_instants, run_away
+from jaxvm.discover.constants import constants_held, other_instants, run_away
 from jaxvm.discover.courses import gaps
 from jaxvm.discover.diagnose import _plain_fit
 from jaxvm.discover.finer import at_finer_constants, best_of, said, scores_about
@@ -110,6 +110,20 @@ def test_constants_that_run_away_are_seen(recorded):
     after = scene.with_effects((replace(lag, constants=(-1.0,)),), (8, 4))
     assert run_away(before, after) and not run_away(before, before)
     assert not run_away(after, after)
+
+
+def test_what_was_found_keeps_its_constants_free_beside_a_new_one(recorded):
+    scene, instant = recorded
+    terms = (Term("sensor.focal"),)
+    lag = Effect("it lags", terms, "time", "onset", (instant,), 0.0, Scope(), (1e-4,))
+    both = scene.with_effects((lag, replace(lag, name="it lags, too")), (8, 4))
+    own, new = both.unknowns.column[both.network.layout.all("constant")][:2]
+    assert both.unknowns.active[[own, new]].all()
+    held = constants_held(both, since=1)
+    assert held[own] and not held[new]
+    others = np.setdiff1d(np.arange(len(held)), [new])
+    assert np.array_equal(held[others], both.unknowns.active[others])
+    assert not constants_held(both)[[own, new]].any()
 
 
 # --- stairs and plays -----------------------------------------------------------------------------

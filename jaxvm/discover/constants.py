@@ -11,10 +11,11 @@ from jaxvm.physics.effects import Effect
 from jaxvm.physics.forms import FORMS
 
 
-def constants_held(scene: Scene) -> np.ndarray:
-    """Active unknowns of a scene with all nonlinear constants held."""
+def constants_held(scene: Scene, since: int = 0) -> np.ndarray:
+    """Active unknowns of a scene with the nonlinear constants of effects held, from one on."""
     active = scene.unknowns.active.copy()
-    columns = scene.unknowns.column[scene.network.layout.all("constant")]
+    first = scene.places()[since][1].start if since else 0
+    columns = scene.unknowns.column[scene.network.layout.all("constant")[first:]]
     active[columns[columns < scene.unknowns.n]] = False
     return active
 

@@ -13,7 +13,7 @@ from jaxvm.discover.constants import sensible
 from jaxvm.discover.diagnosis import Finding
 from jaxvm.discover.hypotheses import Hypothesis
 from jaxvm.discover.rivals import Rival
-from jaxvm.discover.select import n_shown, price, price_of_columns
+from jaxvm.discover.select import price, price_of_columns
 from jaxvm.network.scene import Scene
 from jaxvm.physics.effects import room_for
 from jaxvm.solve.adjust import Adjustment
@@ -157,7 +157,7 @@ def _superfluous(current: Adjustment, findings: list[Finding], n: int) -> list[i
     lost = lost_without(current, findings)
     for k, (finding, rise) in enumerate(zip(findings, lost, strict=True)):
         drop = rise / current.variance_factor
-        price = price_of_columns(finding.hypothesis, n_shown(finding.effect.amplitudes), drop, n)
+        price = price_of_columns(finding.hypothesis, finding.effect.amplitudes, drop, n)
         if drop < price + len(finding.effect.constants) * np.log(n):
             found.append(k)
     return found

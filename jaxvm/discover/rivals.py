@@ -15,14 +15,7 @@ from jaxvm.discover.courses import Course
 from jaxvm.discover.hypotheses import FREE, Family, Hypothesis
 from jaxvm.discover.ranking import Ranking
 from jaxvm.discover.score import ScoreTests
-from jaxvm.discover.select import (
-    DECIDED,
-    decisive_gap,
-    log_prior,
-    n_shown,
-    price_of_columns,
-    stacked,
-)
+from jaxvm.discover.select import DECIDED, decisive_gap, log_prior, price_of_columns, stacked
 from jaxvm.discover.space import member
 from jaxvm.physics.effects import Effect
 from jaxvm.solve.adjust import Adjustment
@@ -97,7 +90,7 @@ def rivals(
     claims: dict[tuple, _Claim] = {}
     own_amplitudes = np.asarray(effect.amplitudes)
     own_prior = log_prior(own, own_amplitudes)
-    own_columns = price_of_columns(own, n_shown(own_amplitudes), full, n)
+    own_columns = price_of_columns(own, own_amplitudes, full, n)
     # What has fewer columns may be behind by what it saves.
     saved = own_columns - np.log(n) if len(own_amplitudes) <= FREE else 0.0
 
@@ -119,7 +112,7 @@ def rivals(
     own_price = min((price for h, _, price, _ in found if h.same(own)), default=0.0)
     prices = {_course_of(h): price for h, _, price, _ in reversed(found)}
     for hypothesis, gap, _, amplitudes in found:
-        columns = price_of_columns(hypothesis, n_shown(amplitudes), full - gap, n) - own_columns
+        columns = price_of_columns(hypothesis, amplitudes, full - gap, n) - own_columns
         if gap + min(columns, 0.0) <= limit:
             cost = columns + prices[_course_of(hypothesis)] - own_price
             behind = shrunk * min(gap, limit) + max(gap - limit, 0.0)

@@ -115,17 +115,12 @@ def evidence(
     Each constant that is refined costs what the drop lets it be known by (Laplace): next to nothing
     where any value does, as much as a column where one value alone does.
     """
-    drop, columns = drop / variance, n_shown(amplitudes)
+    drop = drop / variance
     own = FORMS[hypothesis.course.form].constants[: len(hypothesis.course.constants)]
     refined = min(np.log1p(_SHARP * max(drop, 0.0)), np.log(n))
     constants = sum(refined if constant.refined else np.log(n) for constant in own)
     prior = log_prior(hypothesis, np.asarray(amplitudes))
-    return drop - price_of_columns(hypothesis, columns, drop, n) - constants + 2.0 * prior
-
-
-def n_shown(amplitudes) -> int:
-    """Number of amplitudes that something shows: those of epochs that are set aside stay zero."""
-    return int(np.count_nonzero(amplitudes)) or len(amplitudes)
+    return drop - price_of_columns(hypothesis, amplitudes, drop, n) - constants + 2.0 * prior
 
 
 def price(
@@ -135,14 +130,15 @@ def price(
     return drop / variance - evidence(hypothesis, drop, amplitudes, variance, n)
 
 
-def price_of_columns(hypothesis: Hypothesis, columns: int, drop: float, n: int) -> float:
+def price_of_columns(hypothesis: Hypothesis, amplitudes, drop: float, n: int) -> float:
     """What the amplitudes of a hypothesis cost: ln n each.
 
     Of a map with many tiles each knows little: their prior has the width that the tiles themselves
     show (empirical Bayes), and costs 1 + ln(drop / columns) for each of them, which is less than
-    the ln n of a single unknown.
+    the ln n of a single unknown. Amounts of epochs that are set aside stay zero and cost nothing.
     """
-    if columns > FREE and hypothesis.course.form not in N_KNOTS:
+    columns = int(np.count_nonzero(amplitudes)) or len(amplitudes)
+    if len(amplitudes) > FREE and hypothesis.course.form not in N_KNOTS:
         return float(columns * min(np.log(n), 1.0 + np.log(max(drop / columns, 1.0))))
     return float(columns * np.log(n))
 
@@ -194,12 +190,12 @@ def refit(base: Adjustment, hypothesis: Hypothesis, amplitudes, split: Split) ->
     effects = (*base.scene.fitted_effects(), hypothesis.effect(0.0 * amplitudes))
     scene = base.scene.with_effects(effects, room_for(effects, base.scene.room))
 
-    def fit(scene: Scene, active=None):
+    def fit(scene: Scene, freed: bool = False) -> Adjustment:
         return adjust(
             scene,
             weights=split.weights,
             range_weights=split.range_weights,
-            active=active,
+            active=None if freed else constants_held(scene, since=len(effects) - 1),
             rtol=_RTOL,
             damping=1e-6,
             max_steps=_MAX_STEPS,
@@ -214,10 +210,10 @@ def refit(base: Adjustment, hypothesis: Hypothesis, amplitudes, split: Split) ->
         scene = _with_spread(scene, min(middles)) if middles else scene
         own = np.asarray(fit(scene).scene.fitted_effects()[-1].amplitudes)
         scene = _with_spread(scene, float(np.median(np.abs(own))))
-    fitted = fit(scene, constants_held(scene))
-    if fitted.scene.fitted_effects()[-1].constants and not fitted.failed:
-        # At amplitude zero nothing shows what a constant does: it is freed at the amplitudes.
-        freed = fit(fitted.scene)
+    # At amplitude zero nothing shows what a constant does: it is freed at the amplitudes.
+    fitted = fit(scene)
+    if effects[-1].constants and not fitted.failed:
+        freed = fit(fitted.scene, freed=True)
         # The grid's constants are good enough when a refined one runs away.
         if not freed.failed and sensible(scene, freed.scene.fitted_effects()[-1]):
             fitted = freed

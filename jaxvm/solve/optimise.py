@@ -70,10 +70,9 @@ class Relaxing(optx.ClassicalTrustRegion):
         return _Region(1.0 / jnp.asarray(self.damping), jnp.array(0))
 
     def step(self, first_step, y, y_eval, f_info, f_eval_info, state: Any) -> Any:
-        before = state.step_size
         size, accept, result, _ = super().step(first_step, y, y_eval, f_info, f_eval_info, state)
         again = jnp.minimum(state.rejected, _MOST_CUTS)
-        size = jnp.where(accept, size, before * self.low_constant ** (1.0 + again))
+        size = jnp.where(accept, size, size * self.low_constant**again)
         return size, accept, result, _Region(size, jnp.where(accept, 0, state.rejected + 1))
 
 
@@ -125,17 +124,16 @@ class NormalEquationSolver(optx.AbstractLeastSquaresSolver):
             state.first, y, state.trial, state.info, info, state.search
         )
         accept = accept & (jnp.isfinite(info.f) | state.first)
-        gained = state.info.f - info.f
-        little = self.rtol * info.f + self.atol
-        settled = (jnp.abs(gained) <= little) & (size >= 1.0)
-        stuck = ~accept & (size < 1e-12)
-        done = ~state.first & (settled | stuck)
 
         def choose(new, old):
             return jax.tree.map(lambda a, b: jnp.where(accept, a, b), new, old)
 
         y = jnp.where(accept, state.trial, y)
         kept = choose(info, state.info)
+        little = self.rtol * kept.f + self.atol
+        settled = (jnp.abs(state.info.f - info.f) <= little) & (size >= 1.0)
+        stuck = ~accept & (size < 1e-12)
+        done = ~state.first & (settled | stuck)
         descent = self.descent.query(y, kept, state.descent)
         change, descent_result = self.descent.step(size, descent)
         # A damped matrix that is not positive definite gives no step: damp more and try again.
@@ -143,7 +141,7 @@ class NormalEquationSolver(optx.AbstractLeastSquaresSolver):
         hopeless = failed & (size < 1e-12)
         # What the next step promises, by the quadratic model.
         promised = -jnp.sum(change * (kept.grad + 0.5 * kept.hessian.mv(change)))
-        ends = ~failed & (promised <= self.rtol * kept.f + self.atol)
+        ends = ~failed & (promised <= little)
         unseen = ends & (size >= 1.0) & ~done
         y = jnp.where(unseen, y + change, y)
         done = done | unseen | (ends & ~accept)
