@@ -11,13 +11,15 @@ from jaxvm.discover.constants import constants_held, other_instants, run_away
 from jaxvm.discover.courses import gaps
 from jaxvm.discover.diagnose import _plain_fit
 from jaxvm.discover.finer import at_finer_constants, best_of, said, scores_about
-from jaxvm.discover.heldout import evaluate
+from jaxvm.discover.heldout import evaluate, split
 from jaxvm.discover.score import ScoreTests
 from jaxvm.discover.select import shortlist
 from jaxvm.discover.space import enumerate_hypotheses
 from jaxvm.network.residual import predict_pixels
 from jaxvm.physics.effects import Effect, Scope, Term
 from jaxvm.recording.recording import Drivers
+from jaxvm.solve.adjust import adjust
+from jaxvm.solve.covariance import effect_deviations
 from jaxvm.solve.snooping import robust_variance
 
 N_EPOCHS = 80
@@ -110,6 +112,22 @@ def test_constants_that_run_away_are_seen(recorded):
     after = scene.with_effects((replace(lag, constants=(-1.0,)),), (8, 4))
     assert run_away(before, after) and not run_away(before, before)
     assert not run_away(after, after)
+
+
+def test_a_fit_to_all_epochs_keeps_a_constant_that_would_run_away(recorded):
+    # A jump that is said to settle: no time constant is short enough.
+    scene, instant = recorded
+    settling = replace(slipped(instant), form="settling", constants=(instant, 2.0))
+    scene = scene.with_effects((settling,), (8, 4))
+    parts, _, _ = _plain_fit(scene.with_effects((), (8, 4)), 3)
+    free = adjust(scene, weights=parts.sound, check=False)
+    assert run_away(scene, free.scene)
+    final = split(scene, np.zeros(N_EPOCHS, bool), parts.sound).fit(scene)
+    assert final.scene.fitted_effects()[0].constants == (instant, 2.0)
+    assert np.isfinite(effect_deviations(final)).all()
+    # The size is fitted all the same.
+    sizes = np.abs(final.scene.fitted_effects()[0].amplitudes)
+    np.testing.assert_allclose(sizes, 3e-4, atol=1e-4)
 
 
 def test_what_was_found_keeps_its_constants_free_beside_a_new_one(recorded):

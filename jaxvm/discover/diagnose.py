@@ -81,7 +81,8 @@ def diagnose(
     current, findings = found.current, found.findings
 
     progress("final fit to all epochs")
-    final = adjust(current.scene, weights=parts.sound, check=False)
+    everything = split(scene, np.zeros(len(parts.held), bool), parts.sound)
+    final = everything.fit(current.scene)
     final = _with_best_instants(final, parts.sound)
     final = _with_first_states(final, parts.sound)
     excess = 2.0 * plain.cost - current.variance_factor * plain.degrees_of_freedom

@@ -92,7 +92,7 @@ class Split:
     def fit(self, scene: Scene, check: bool = False, wanted: float = np.inf) -> Adjustment:
         """Adjustment of a scene to the fitted epochs, given up where it won't get to a cost.
 
-        Nonlinear constants that run away are held where they began.
+        Nonlinear constants that run away, or break the fit down, are held where they began.
         """
 
         def fit(active: np.ndarray | None) -> Adjustment:
@@ -108,7 +108,9 @@ class Split:
             )
 
         fitted = fit(None)
-        return fit(constants_held(scene)) if run_away(scene, fitted.scene) else fitted
+        if fitted.failed or run_away(scene, fitted.scene):
+            return fit(constants_held(scene))
+        return fitted
 
     def evaluate(self, scene: Scene) -> HeldOut:
         """Errors of a fitted scene on the epochs set aside."""
