@@ -5,8 +5,9 @@
 Takes scored recordings (`solve.py`, `score.py`) in which a finding has doubles and advice. The
 world makes the same scene again under the plan that was named best, `jaxvm diagnose FIRST --with
 SECOND` sees the two and nothing else, and the key tells whether the doubles came apart: the right
-name first, and of no pair that the plan promised to part both names left in its set. Stricter is
-*alone*: no other name at all is left there. Writes DIR/follow.json and prints a table.
+name in a set that has no longer both names of any pair that the plan promised to part. Stricter are
+*first*: it leads there, too; and *alone*: no other name at all is left. Writes DIR/follow.json and
+prints a table.
 """
 
 import argparse
@@ -83,7 +84,7 @@ def follow(folder: Path, case: dict) -> dict:
 
 
 def outcome(case: dict, report: dict, facts: Facts) -> dict:
-    """Whether the right name comes first after both recordings, and what is left beside it.
+    """Whether the right name is found after both recordings, and what is left beside it.
 
     Of several hidden effects those count that the finding may have been: another one that comes out
     right says nothing of this advice.
@@ -94,7 +95,8 @@ def outcome(case: dict, report: dict, facts: Facts) -> dict:
         return any(same_name(truth, rows, facts) for truth in truths)
 
     meant = [t for t in case["entry"]["hidden"] if any(right(c, [t]) for c in case["claims"])]
-    found = [f for f in report["findings"] if right(claims(f)[0], meant)]
+    found = [f for f in report["findings"] if any(right(c, meant) for c in claims(f))]
+    first = [right(claims(f)[0], meant) for f in found]
     pairs = [{case["before"][0], rival} for rival in case["rivals"]]
     # A name that is no other physics for the key (an exact tie) is not left over.
     alone = [all(right(claim, meant) for claim in claims(f)) for f in found]
@@ -103,6 +105,7 @@ def outcome(case: dict, report: dict, facts: Facts) -> dict:
         "after": [_names(finding) for finding in report["findings"]],
         "meant": [truth["effect"] for truth in meant],
         "apart": any(a or p for a, p in zip(alone, parted, strict=True)),
+        "first": any(f and (a or p) for f, a, p in zip(first, alone, parted, strict=True)),
         "alone": any(alone),
     }
 
@@ -126,10 +129,12 @@ def main() -> None:
             state = "apart" if case.get("apart") else case.get("after", case.get("failed"))
             words = f"{case['id']}  {case['hidden']}  {case['before']}  {case['plan']}"
             print(f"{words}  ({case['chance']:.0%}): {state}", flush=True)
-    apart, alone = (sum(case.get(key, False) for case in results) for key in ("apart", "alone"))
+    apart, first, alone = (
+        sum(case.get(key, False) for case in results) for key in ("apart", "first", "alone")
+    )
     number, expected = len(results), sum(case["chance"] for case in results)
     print(f"{apart} of {number} that were promised to come apart did ({expected:.1f} expected),")
-    print(f"{alone} of them to the right name alone")
+    print(f"{first} of them with the right name first, {alone} with it alone")
     (folder / "follow.json").write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
 
 
