@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxvm.network.residual import predict_pixels
 from jaxvm.network.scene import Scene, build
+from jaxvm.physics.drivers import air_and_bodies, channel_kind
 from jaxvm.recording import Drivers, Recording
 from jaxvm.recording.join import PAUSE_S
 
@@ -23,22 +24,18 @@ from jaxvm.recording.join import PAUSE_S
 class Plan:
     """One kind of further recording.
 
-    It is made on another day: what went on with time has gone on since.
-
     Attributes:
         key: stable name.
         words: what to do, for an engineer.
         poses: changes the poses [targets, epochs, 6] of the targets that move, from the middles of
             their marks (target coordinates), the eye that sees them and the upward direction.
         recording: changes the circumstances (drivers, velocities, power).
-        anew: whether it begins where the first began: clocks start anew.
     """
 
     key: str
     words: str
     poses: Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray] | None = None
     recording: Callable[[Recording], Recording] | None = None
-    anew: bool = False
 
 
 @dataclass(frozen=True)
@@ -108,21 +105,50 @@ def _swept(poses, middles, eye, up):
 
 
 def _cycle(recording: Recording) -> Recording:
-    """Temperatures go up by twice the span seen and return, within a third of the time."""
+    """Temperatures go up by twice the span seen and return, within a third of the time.
+
+    Bodies can't be told what to do: where the air's temperature is known, they follow it as before.
+    """
     drivers = recording.drivers
     assert drivers is not None
-    time = drivers.time
+    time, channels = drivers.time, dict(drivers.channels)
     share = (time - time[0]) / max(time[-1] - time[0], 1e-9)
     up = np.clip(np.minimum(share / 0.3, (0.8 - share) / 0.3), 0.0, 1.0)
-    channels = {
-        name: values.mean() + 2.0 * np.ptp(values) * up if _warms(name) else values
-        for name, values in drivers.channels.items()
-    }
+    air, bodies = air_and_bodies(channels)
+    led = bodies if air else ()
+    for name in channels:
+        if _warms(name) and name not in led:
+            channels[name] = channels[name].mean() + 2.0 * np.ptp(channels[name]) * up
+    for name in led:
+        channels[name] = _following(time, drivers.channels[air], channels[name], channels[air])
     return replace(recording, drivers=Drivers(time, channels))
 
 
+def _following(time, air, body, new_air) -> np.ndarray:
+    """The temperature of a body when the air's is another one.
+
+    A first-order lag, dT/dt = k (air - T) + q, whose k and q are fitted to what was seen in its
+    integrated form.
+    """
+    step = np.diff(time)
+
+    def integral(values):
+        return np.append(0.0, np.cumsum(0.5 * (values[1:] + values[:-1]) * step))
+
+    design = np.stack([integral(air - body), time - time[0]], axis=1)
+    rate = np.linalg.lstsq(design, body - body[0], rcond=None)[0][0]
+    # The change of the air alone is added, so that what warms the body otherwise stays.
+    kept = np.exp(-max(rate, 0.0) * step)
+    change, added = new_air - air, np.zeros(len(time))
+    added[0] = change[0] if rate > 0.0 else 0.0
+    for k in range(len(step)):
+        middle = 0.5 * (change[k] + change[k + 1])
+        added[k + 1] = kept[k] * added[k] + (1.0 - kept[k]) * middle
+    return body + added
+
+
 def _warms(name: str) -> bool:
-    return name.endswith(("_degC", "_K"))
+    return channel_kind(name) == "temperature"
 
 
 def _reversed(recording: Recording) -> Recording:
@@ -168,7 +194,7 @@ PLANS: tuple[Plan, ...] = (
     Plan("cycle", "a faster cycle of heating and cooling that returns", recording=_cycle),
     Plan("reverse", "the motion the other way and twice as fast", recording=_reversed),
     Plan("restart", "the cameras switched off and on again in the middle", recording=_restarted),
-    Plan("longer", "the same for twice as long", recording=_longer, anew=True),
+    Plan("longer", "the same for twice as long", recording=_longer),
 )
 """Further recordings that are weighed, in the order of their cost."""
 
@@ -186,10 +212,16 @@ def possible(plan: Plan, recording: Recording) -> bool:
     return recording.timed
 
 
-def planned(plan: Plan, scene: Scene) -> Planned:
+def planned(plan: Plan, scene: Scene, another_day: bool = False) -> Planned:
     """The scene of a planned recording: the fitted cameras and bodies under other conditions.
 
     Marks that would leave the image, or come behind the camera, have weight zero.
+
+    Args:
+        plan: what is changed.
+        scene: the fitted model of the first recording.
+        another_day: what went on with time has gone on since the first recording; otherwise its
+            clock starts anew.
     """
     recording = scene.recording
     if plan.recording is not None:
@@ -203,7 +235,7 @@ def planned(plan: Plan, scene: Scene) -> Planned:
         lambda s: (s.amplitude, s.constant), state, (blank.amplitude, blank.constant)
     )
     changed = replace(changed, state=state)
-    if not plan.anew:
+    if another_day:
         changed = _on_another_day(changed)
     changed = changed.with_effects(scene.fitted_effects(), scene.room)
     sizes = np.array([c.image_size for c in scene.model.cameras], float)

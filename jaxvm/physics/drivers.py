@@ -8,7 +8,7 @@ residuals explains noise. (A mark at rest shows noise e at phase phi; e sin 2 pi
 average out.)
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -322,10 +322,15 @@ def build_channels(
 
 def _differences(recorded: dict[str, Float[np.ndarray, " times"]]) -> dict[str, np.ndarray]:
     """Temperatures of bodies against that of the air (K)."""
-    warm = [name for name in recorded if channel_kind(name) == "temperature"]
+    air, bodies = air_and_bodies(recorded)
+    return {f"{name} - {air}": recorded[name] - recorded[air] for name in bodies if air}
+
+
+def air_and_bodies(names: Iterable[str]) -> tuple[str, tuple[str, ...]]:
+    """The channel of the air's temperature, "" without one, and those of bodies."""
+    warm = [name for name in names if channel_kind(name) == "temperature"]
     air = next((name for name in warm if name.startswith(("ambient", "air"))), "")
-    bodies = [name for name in warm if air and name.startswith("body_")]
-    return {f"{name} - {air}": recorded[name] - recorded[air] for name in bodies}
+    return air, tuple(name for name in warm if name.startswith("body_"))
 
 
 def since(time: np.ndarray, moments: np.ndarray) -> np.ndarray:
