@@ -10,11 +10,12 @@ import pytest
 from networks import HELD, IMAGE, at_values, stereo_recording
 from scipy.spatial.transform import Rotation
 
-from jaxvm.discover.advice import _chances, _information, advise
+from jaxvm.discover.advice import _batches, _chances, _information, advise
 from jaxvm.discover.courses import Course
 from jaxvm.discover.groups import Group
 from jaxvm.discover.hypotheses import Hypothesis
 from jaxvm.discover.plans import PLANS, Plan, planned, possible
+from jaxvm.discover.rivals import Rival
 from jaxvm.discover.select import DECIDED
 from jaxvm.geometry.targets import grid_points
 from jaxvm.network.residual import predict_pixels
@@ -43,6 +44,10 @@ def rival(port: str, driver: str, form: str, reference: float = 0.0) -> Hypothes
     """One port of the left camera."""
     course = Course(driver, form, (), reference)
     return Hypothesis(Group((Term(port),), "camera"), course, Scope(camera=("left",)), ())
+
+
+def as_rivals(*hypotheses: Hypothesis) -> tuple[Rival, ...]:
+    return tuple(Rival(hypothesis, 0.0, 1.0) for hypothesis in hypotheses)
 
 
 def predicted(scene: Scene) -> np.ndarray:
@@ -126,16 +131,24 @@ def dense_jacobian(problem, x):
 def test_the_predicted_gap_is_the_difference_of_refits(stereo, driver, amplitude):
     """Noise-free recordings, the present and the planned one, fitted with the rival instead.
 
-    What goes with time has gone on for a day before the second.
+    What goes with time has gone on for a day before the second; nothing is promised from that.
     """
     reference = 20.0 if driver == "body_degC" else 0.0
     right = rival("sensor.focal", driver, "linear", reference)
     wrong = rival("mount.shift_z", driver, "linear", reference)
     stereo = stereo.with_effects((right.effect((amplitude,)),), ROOM)
     stereo = at_pixels(stereo, with_pixels(stereo))
-    (advice,) = advise(stereo, ones(stereo), 0, (wrong,), 1.0, (PLAN["farther"],))
-    (gap,) = advice.gaps
-    further = planned(PLAN["farther"], stereo)
+    (advice,) = advise(stereo, ones(stereo), 0, as_rivals(wrong), 1.0, (PLAN["farther"],))
+    further = planned(PLAN["farther"], stereo, another_day=True)
+    (batch,) = _batches(stereo, 0, as_rivals(wrong), ())
+    present = _information(batch.scene, ones(stereo))
+    both = present + _information(batch.under(further.scene), further.weights)
+    (gap,) = batch.gaps(both, batch.mimics(present))
+    (promised,) = advice.gaps
+    if driver == "time":
+        assert promised < 0.5 * gap
+    else:
+        assert promised == pytest.approx(gap, rel=1e-6)
     used = np.zeros(len(stereo.recording.observations.epoch), bool)
     for rows, weight in zip(further.scene.tables, further.weights, strict=True):
         used[rows] = weight > 0
@@ -162,8 +175,8 @@ def test_the_predicted_gap_is_the_difference_of_refits(stereo, driver, amplitude
 
 def test_a_larger_effect_and_less_noise_decide_more(stereo):
     plans = (PLAN["nearer"], PLAN["roll"])
-    first = advise(stereo, ones(stereo), 0, (SHIFT,), 1.0, plans)
-    louder = advise(stereo, ones(stereo), 0, (SHIFT,), 4.0, plans)
+    first = advise(stereo, ones(stereo), 0, as_rivals(SHIFT), 1.0, plans)
+    louder = advise(stereo, ones(stereo), 0, as_rivals(SHIFT), 4.0, plans)
     for one, two in zip(first, louder, strict=True):
         assert one.plan.key == two.plan.key
         assert two.gaps[0] == pytest.approx(one.gaps[0] / 4.0)
@@ -178,10 +191,10 @@ def test_rivals_beside_each_other_are_weighed_alone(stereo):
     rivals = (SHIFT, turn, parabola, late)
     assert stereo.room[0] < 1 + 5
     plans = (PLAN["nearer"],)
-    (together,) = advise(stereo, ones(stereo), 0, rivals, 1.0, plans)
+    (together,) = advise(stereo, ones(stereo), 0, as_rivals(*rivals), 1.0, plans)
     assert together.rivals == rivals
     for k, one in enumerate(rivals):
-        (alone,) = advise(stereo, ones(stereo), 0, (one,), 1.0, plans)
+        (alone,) = advise(stereo, ones(stereo), 0, as_rivals(one), 1.0, plans)
         assert together.gaps[k] == pytest.approx(alone.gaps[0], rel=1e-6, abs=1e-6)
     # What contains the finding fits whatever is recorded.
     assert together.gaps[2] < 0.05 < 1.0 < together.gaps[0]
@@ -194,9 +207,9 @@ def test_what_has_no_room_is_not_weighed(stereo):
         Scope(target=("plate",)),
         (),
     )
-    (advice,) = advise(stereo, ones(stereo), 0, (wide, SHIFT), 1.0, (PLAN["nearer"],))
+    (advice,) = advise(stereo, ones(stereo), 0, as_rivals(wide, SHIFT), 1.0, (PLAN["nearer"],))
     assert advice.rivals == (SHIFT,)
-    assert advise(stereo, ones(stereo), 0, (wide,), 1.0, (PLAN["nearer"],)) == []
+    assert advise(stereo, ones(stereo), 0, as_rivals(wide), 1.0, (PLAN["nearer"],)) == []
 
 
 @pytest.mark.parametrize(("log_odds", "gain"), [(0.0, 9.0), (4.0, 20.0), (-3.0, 30.0), (2.0, 0.1)])
@@ -264,7 +277,8 @@ def test_focal_length_and_axial_shift_come_apart_with_distance_only(frontal):
     twin = rival("mount.shift_z", "constant", "constant")
     plans = (PLAN["farther"], PLAN["nearer"], PLAN["roll"])
     advices = {
-        a.plan.key: a.gaps[0] for a in advise(frontal, ones(frontal), 0, (twin,), 1.0, plans)
+        a.plan.key: a.gaps[0]
+        for a in advise(frontal, ones(frontal), 0, as_rivals(twin), 1.0, plans)
     }
     alone = size(frontal, ones(frontal))
     assert alone > 10.0
@@ -277,7 +291,9 @@ def test_focal_length_and_axial_shift_come_apart_with_distance_only(frontal):
         total = alone + size(further.scene, further.weights)
         assert total == pytest.approx(alone * (1.0 + w), rel=1e-3)
         rho2 = (1.0 + w / r) ** 2 / ((1.0 + w) * (1.0 + w / r**2))
-        assert advices[key] == pytest.approx(total * (1.0 - rho2), rel=0.01)
+        # A shift that does the same here does less from afar, and more from nearby.
+        shifted = alone * (1.0 + w / r**2)
+        assert advices[key] == pytest.approx(min(total, shifted) * (1.0 - rho2), rel=0.01)
 
 
 def test_a_pair_that_distance_does_not_part(frontal):
@@ -285,7 +301,7 @@ def test_a_pair_that_distance_does_not_part(frontal):
     effect = rival("sensor.cx", "constant", "constant").effect((0.05,))
     scene = frontal.with_effects((effect,), ROOM)
     twin = rival("detect.u", "constant", "constant")
-    for advice in advise(scene, ones(scene), 0, (twin,), 1.0, tuple(PLAN.values())):
+    for advice in advise(scene, ones(scene), 0, as_rivals(twin), 1.0, tuple(PLAN.values())):
         assert advice.gaps[0] < 1e-3 and not advice.decides
 
 
@@ -429,5 +445,5 @@ def test_a_plan_needs_what_it_changes(stereo, frontal):
         if plan.poses is not None:
             assert possible(plan, recording) and not possible(plan, held)
     assert not possible(PLAN["longer"], replace(recording, timed=False))
-    keys = {a.plan.key for a in advise(stereo, ones(stereo), 0, (SHIFT,), 1.0)}
+    keys = {a.plan.key for a in advise(stereo, ones(stereo), 0, as_rivals(SHIFT), 1.0)}
     assert keys == set(could)

@@ -6,14 +6,20 @@ amplitudes of the finding (columns C), B the other unknowns and R the columns of
 
     lambda (1 - rho^2) = a^T (N_CC - N_CP N_PP^-1 N_PC) a,    P = B and R,
 
-is the expected gap in chi-square between the finding and the rival (MATHEMATICS 1.8). What the
-first recording has shown is known. A further one that adds d to the gap makes of the log odds l (on
-the scale of chi-square) a normal variable of variance 4 d and of mean l + d where the finding is
-right, l - d where the rival is.
+is the expected gap in chi-square between the finding and the rival (MATHEMATICS 1.8). Where the
+rival is right, with the amplitudes that stand for the finding in the first recording, it is that
+of the rival to the finding; the smaller of the two counts. Either may follow any of its drivers,
+and nobody knows whether what goes with time begins anew or has gone on for a day: what parts the
+two only because of that is no promise.
+
+What the first recording has shown is known. A further one that adds d to the gap makes of the log
+odds l (on the scale of chi-square) a normal variable of variance 4 d and of mean l + d where the
+finding is right, l - d where the rival is.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import chain, count, islice
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -22,9 +28,10 @@ from scipy.special import ndtr
 
 from jaxvm.discover.hypotheses import Hypothesis
 from jaxvm.discover.plans import PLANS, Plan, planned, possible
+from jaxvm.discover.rivals import Rival
 from jaxvm.discover.select import decisive_gap
 from jaxvm.network.scene import Scene
-from jaxvm.physics.effects import room_for
+from jaxvm.physics.effects import Effect, room_for
 from jaxvm.solve.adjust import with_weights
 from jaxvm.solve.arrow import Arrow, factorise
 from jaxvm.solve.problem import normal_at, scene_problem
@@ -72,10 +79,11 @@ def advise(
     scene: Scene,
     weights: tuple[np.ndarray, ...],
     place: int,
-    rivals: Sequence[Hypothesis],
+    rivals: Sequence[Rival],
     variance: float,
     plans: tuple[Plan, ...] = PLANS,
     log_odds: Sequence[float] | None = None,
+    others: Sequence[Hypothesis] = (),
 ) -> list[Advice]:
     """Plans by what they bring for telling a finding from its rivals, best first.
 
@@ -91,59 +99,169 @@ def advise(
         plans: further recordings to weigh.
         log_odds: twice the natural log of the odds for the finding against each rival, as they
             stand; even without.
+        others: the finding's own physics after other drivers.
     """
-    batches = _batches(scene, rivals)
-    kept = [k for _, numbers in batches for k in numbers]
+    batches = _batches(scene, place, rivals, others)
+    kept = [number for batch in batches for number in batch.rivals]
     if not kept:
         return []
-    even = np.zeros(len(rivals)) if log_odds is None else np.array(log_odds)
+    even = (np.zeros(len(rivals)) if log_odds is None else np.array(log_odds))[kept]
+    present = [_information(batch.scene, weights) for batch in batches]
+    mimics = [batch.mimics(own) for batch, own in zip(batches, present, strict=True)]
 
-    def gaps(bound: Scene, own: tuple[np.ndarray, ...], known: list[np.ndarray]):
-        """Gaps to all rivals, the drop of the finding, and the information of every batch."""
-        found, total, drop = [], [], 0.0
-        for (with_rivals, numbers), before in zip(batches, known, strict=True):
-            again = bound.with_effects(with_rivals.fitted_effects(), scene.room)
-            total.append(before + _information(again, own))
-            first = len(with_rivals.effects) - len(numbers)
-            rest = range(first, len(with_rivals.effects))
-            found += [_gap(with_rivals, place, {*rest} - {k}, total[-1]) for k in rest]
-            drop = _gap(with_rivals, place, {*rest}, total[-1])
-        return np.array(found) / variance, drop / variance, total
+    def gaps(information: list[np.ndarray]) -> np.ndarray:
+        each = zip(batches, information, mimics, strict=True)
+        found = [batch.gaps(own, mimic) for batch, own, mimic in each]
+        return np.concatenate(found) / variance
 
-    present, _, known = gaps(scene, weights, [np.zeros(())] * len(batches))
+    before = gaps(present)
     advices = []
     for plan in plans:
-        if possible(plan, scene.recording):
-            further = planned(plan, scene)
-            expected, drop, _ = gaps(further.scene, further.weights, known)
-            gain = np.maximum(expected - present, 0.0)
-            chances = _chances(even[kept], gain, decisive_gap(drop))
-            own = tuple(rivals[k] for k in kept)
-            advices.append(Advice(plan, own, tuple(expected.tolist()), tuple(chances.tolist())))
+        if not possible(plan, scene.recording):
+            continue
+        expected, drop = np.full(len(kept), np.inf), np.inf
+        for another_day in (False, True) if scene.recording.timed else (False,):
+            further = planned(plan, scene, another_day)
+            both = [
+                known + _information(batch.under(further.scene), further.weights)
+                for batch, known in zip(batches, present, strict=True)
+            ]
+            expected = np.minimum(expected, gaps(both))
+            drop = min(drop, batches[0].drop(both[0]) / variance)
+        gain = np.maximum(expected - before, 0.0)
+        chances = _chances(even, gain, decisive_gap(drop))
+        own = tuple(rivals[k].hypothesis for k in kept)
+        advices.append(Advice(plan, own, tuple(expected.tolist()), tuple(chances.tolist())))
     return sorted(advices, key=lambda advice: -min(advice.chance, _SURE))
 
 
-def _batches(scene: Scene, rivals: Sequence[Hypothesis]) -> list[tuple[Scene, list[int]]]:
-    """The scene with rivals at amplitude zero after its effects, as many at once as have room.
+@dataclass(frozen=True)
+class _Batch:
+    """The scene of a finding, with some rivals after its effects, at amplitude zero.
 
-    One that has no room alone is left out: it would need programs of its own.
+    Attributes:
+        scene: with all of them.
+        place: number of the finding among the effects.
+        others: numbers of the effects that are its own physics after other drivers.
+        rivals: numbers of the effects of each rival, the leading one first, by the rival's number.
+    """
+
+    scene: Scene
+    place: int
+    others: tuple[int, ...]
+    rivals: dict[int, tuple[int, ...]]
+
+    def under(self, scene: Scene) -> Scene:
+        """The same effects under other circumstances."""
+        return scene.with_effects(self.scene.fitted_effects(), self.scene.room)
+
+    def drop(self, information: np.ndarray) -> float:
+        """What the finding explains and the rest of the model does not."""
+        amplitudes = self._amplitudes()
+        return _square(amplitudes, self._without(information, [self.place], []))
+
+    def mimics(self, information: np.ndarray) -> list[np.ndarray]:
+        """Amplitudes of the rivals that stand for the finding."""
+        found = []
+        for leading, *_ in self.rivals.values():
+            both = self._without(information, [self.place, leading], [])
+            n = len(self._columns([self.place]))
+            known = np.linalg.pinv(both[n:, n:], rcond=1e-10, hermitian=True)
+            found.append(known @ both[n:, :n] @ self._amplitudes())
+        return found
+
+    def gaps(self, information: np.ndarray, mimics: list[np.ndarray]) -> np.ndarray:
+        """The smaller of the gaps where the finding is right and where the rival is, of each."""
+        own = (self.place, *self.others)
+        found = []
+        for mimic, each in zip(mimics, self.rivals.values(), strict=True):
+            finding = self._without(information, own[:1], each)
+            rival = self._without(information, each[:1], own)
+            found.append(min(_square(self._amplitudes(), finding), _square(mimic, rival)))
+        return np.array(found)
+
+    def _amplitudes(self) -> np.ndarray:
+        return np.asarray(self.scene.state.amplitude)[self.scene.places()[self.place][0]]
+
+    def _columns(self, effects: Iterable[int], constants: bool = False) -> list[int]:
+        """Numbers of the unknowns of effects; their constants after their amplitudes."""
+        layout, column = self.scene.network.layout, self.scene.unknowns.column
+        places = [self.scene.places()[k] for k in effects]
+        found = [column[layout.all("amplitude")[own]] for own, _ in places]
+        if constants:
+            found += [column[layout.all("constant")[own]] for _, own in places]
+        return [int(k) for each in found for k in each]
+
+    def _without(
+        self, information: np.ndarray, own: Sequence[int], present: Sequence[int]
+    ) -> np.ndarray:
+        """Information on the amplitudes of effects that the rest of the model leaves.
+
+        Args:
+            information: of all shared unknowns.
+            own: numbers of the effects; their constants are held.
+            present: numbers of those that the rest has, of all that are in question.
+        """
+        question = {self.place, *self.others, *(k for each in self.rivals.values() for k in each)}
+        absent = {*self._columns((question - {*present}) | {*own}, constants=True)}
+        diagonal = np.diag(information)
+        other = np.array([k for k in np.flatnonzero(diagonal > 0.0) if k not in absent], int)
+        columns = np.array(self._columns(own), int)
+        scale = 1.0 / np.sqrt(diagonal[other])
+        block = scale[:, None] * information[np.ix_(other, other)] * scale
+        cross = scale[:, None] * information[np.ix_(other, columns)]
+        explained = cross.T @ np.linalg.pinv(block, rcond=1e-10, hermitian=True) @ cross
+        return information[np.ix_(columns, columns)] - explained
+
+
+def _square(vector: np.ndarray, matrix: np.ndarray) -> float:
+    return max(float(vector @ matrix @ vector), 0.0)
+
+
+def _batches(
+    scene: Scene, place: int, rivals: Sequence[Rival], others: Sequence[Hypothesis]
+) -> list[_Batch]:
+    """As many rivals at once as the scene has room for.
+
+    One that has no room alone is left out: it would need programs of its own. So are the last of
+    the drivers that the finding or a rival may follow as well.
     """
     present = scene.fitted_effects()
-    new = [rival.effect(np.zeros(rival.n_columns)) for rival in rivals]
 
-    def together(numbers: list[int]):
-        return (*present, *(new[k] for k in numbers))
+    def has_room(*hypotheses: Hypothesis) -> bool:
+        return room_for((*present, *map(_at_zero, hypotheses)), scene.room) == scene.room
 
-    def has_room(numbers: list[int]) -> bool:
-        return room_for(together(numbers), scene.room) == scene.room
+    known = {k: r for k, r in enumerate(rivals) if has_room(r.hypothesis)}
+    own: list[Hypothesis] = []
+    for other in others:
+        if all(has_room(*own, other, rival.hypothesis) for rival in known.values()):
+            own.append(other)
+    groups: list[dict[int, list[Hypothesis]]] = []
+    for number, rival in known.items():
+        group = [rival.hypothesis]
+        for other in rival.others:
+            group += [other] if has_room(*own, *group, other) else []
+        if not groups or not has_room(*own, *chain(*groups[-1].values()), *group):
+            groups.append({})
+        groups[-1][number] = group
 
-    batches: list[list[int]] = []
-    for k in range(len(rivals)):
-        if batches and has_room([*batches[-1], k]):
-            batches[-1].append(k)
-        elif has_room([k]):
-            batches.append([k])
-    return [(scene.with_effects(together(own), scene.room), own) for own in batches]
+    found = []
+    for each in groups:
+        effects = map(_at_zero, (*own, *chain(*each.values())))
+        numbers = count(len(present))
+        found.append(
+            _Batch(
+                scene.with_effects((*present, *effects), scene.room),
+                place,
+                tuple(islice(numbers, len(own))),
+                {k: tuple(islice(numbers, len(group))) for k, group in each.items()},
+            )
+        )
+    return found
+
+
+def _at_zero(hypothesis: Hypothesis) -> Effect:
+    return hypothesis.effect(np.zeros(hypothesis.n_columns))
 
 
 def _chances(log_odds: np.ndarray, gain: np.ndarray, needed: float) -> np.ndarray:
@@ -178,28 +296,3 @@ def _reduced(hessian: Arrow):
     d, s = factors.coupled.shape[1:]
     tall = jnp.reshape(factors.coupled, (-1, s)) if d else jnp.zeros((0, s))
     return (scaled.shared - tall.T @ tall) / (a[:, None] * a)
-
-
-def _gap(scene: Scene, place: int, absent: set[int], information: np.ndarray) -> float:
-    """Drop of chi-square by a finding that neither the model nor other effects take.
-
-    Args:
-        scene: with rivals after its effects.
-        place: number of the finding among the effects.
-        absent: numbers of effects that are not in the model.
-        information: of the shared unknowns.
-    """
-    layout, column = scene.network.layout, scene.unknowns.column
-    columns = [column[layout.all("amplitude")[own]] for own, _ in scene.places()]
-    constants = [column[layout.all("constant")[own]] for _, own in scene.places()]
-    left_out = {k for e in {place, *absent} for k in (*columns[e], *constants[e])}
-    diagonal = np.diag(information)
-    other = [k for k in range(len(information)) if k not in left_out and diagonal[k] > 0]
-    other = np.array(other, int)
-    own, amplitude = columns[place], np.asarray(scene.state.amplitude)[scene.places()[place][0]]
-    scale = 1.0 / np.sqrt(diagonal[other])
-    block = scale[:, None] * information[np.ix_(other, other)] * scale
-    cross = scale[:, None] * information[np.ix_(other, own)]
-    explained = cross.T @ np.linalg.pinv(block, rcond=1e-10, hermitian=True) @ cross
-    rest = information[np.ix_(own, own)] - explained
-    return max(float(amplitude @ rest @ amplitude), 0.0)

@@ -128,17 +128,25 @@ def diagnose(
 
 def _with_advice(final: Adjustment, finding: Finding, place: int, parts: Split) -> Finding:
     """A finding with the further recordings that would tell it from its rivals."""
-    # Another name for the same course, and what contains it, fits whatever is recorded further.
-    others = [r for r in finding.rivals if not r.hypothesis.contains(finding.hypothesis)]
+    # Another name for the same course, and what contains it, fits whatever is recorded further;
+    # and what may have this name, too, says nothing against it.
+    own = {entry.id for entry in finding.hypothesis.entries[:1]}
+    others = [
+        r
+        for r in finding.rivals
+        if not r.hypothesis.contains(finding.hypothesis)
+        and not (own & {*r.names} and not own & {e.id for e in r.hypothesis.entries})
+    ]
     found = advise(
         final.scene,
         parts.sound,
         place,
-        [r.hypothesis for r in others],
+        others,
         final.variance_factor * finding.noise,
         log_odds=[
             2.0 * float(np.log(max(finding.weight, 1e-9) / rival.weight)) for rival in others
         ],
+        others=finding.others,
     )
     return replace(finding, advice=tuple(found))
 

@@ -25,7 +25,7 @@ class Finding:
         stds: standard deviations of the amplitudes, then of the constants.
         final_effect, final_stds: the same from all epochs, together with all later findings.
         weight: posterior weight among its doubles.
-        drivers: others that it may follow as well.
+        others: the same physics after other drivers, which it may follow as well.
         rivals: hypotheses that this recording can't tell from it.
         p_value: family-wise, under noise that remembers as long as the residuals do.
         p_independent: the same for noise that is independent from epoch to epoch.
@@ -50,7 +50,7 @@ class Finding:
     final_effect: Effect
     final_stds: tuple[float, ...]
     weight: float
-    drivers: tuple[str, ...]
+    others: tuple[Hypothesis, ...]
     rivals: tuple[Rival, ...]
     p_value: float
     p_independent: float

@@ -121,14 +121,14 @@ def likelier(
     tried = fit(scene.with_effects(tuple(effects), room_for(tuple(effects), scene.room)))
     if not tried.converged:
         return current, findings
-    before = Rival(finding.hypothesis, 0.0, finding.weight, finding.drivers)
+    before = Rival(finding.hypothesis, 0.0, finding.weight, finding.others)
     others = [rival for rival in (*finding.rivals, before) if rival is not best]
     leading = replace(
         finding,
         hypothesis=best.hypothesis,
         stds=(),
         weight=best.weight,
-        drivers=best.drivers,
+        others=best.others,
         rivals=tuple(sorted(others, key=lambda rival: -rival.weight)),
     )
     return tried, with_effects([*findings[:k], leading, *findings[k + 1 :]], tried)

@@ -34,13 +34,15 @@ class Rival:
         hypothesis: what it is.
         gap: by how much it is expected to be worse (chi-square).
         weight: posterior weight among all doubles.
-        drivers: others that this physics may follow as well.
+        others: the same physics after other drivers, which it may follow as well.
+        names: all that its combination may be called.
     """
 
     hypothesis: Hypothesis
     gap: float
     weight: float
-    drivers: tuple[str, ...] = ()
+    others: tuple[Hypothesis, ...] = ()
+    names: tuple[str, ...] = ()
 
 
 @dataclass
@@ -48,13 +50,14 @@ class _Claim:
     """One name at one place, with all drivers that do."""
 
     hypothesis: Hypothesis
+    names: tuple[str, ...]
     gap: float
     log_odds: float
-    of_driver: dict[str, float] = field(default_factory=dict)
+    of_driver: dict[str, tuple[float, Hypothesis]] = field(default_factory=dict)
 
     @property
     def weight(self) -> float:
-        return float(np.logaddexp.reduce(list(self.of_driver.values())))
+        return float(np.logaddexp.reduce([odds for odds, _ in self.of_driver.values()]))
 
 
 def rivals(
@@ -95,13 +98,16 @@ def rivals(
     saved = own_columns - np.log(n) if len(own_amplitudes) <= FREE else 0.0
 
     def weigh(hypothesis: Hypothesis, amplitudes: np.ndarray, gap: float, fit: float) -> None:
+        names = tuple(entry.id for entry in hypothesis.entries)
         for named in _one_by_one(hypothesis):
-            odds = fit + log_prior(named, np.asarray(amplitudes)) - own_prior
-            claim = claims.setdefault(_claim_of(named), _Claim(named, gap, -np.inf))
+            odds = float(fit + log_prior(named, np.asarray(amplitudes)) - own_prior)
+            claim = claims.setdefault(_claim_of(named), _Claim(named, names, gap, -np.inf))
             if odds > claim.log_odds:
-                claim.hypothesis, claim.gap, claim.log_odds = named, gap, float(odds)
+                claim.hypothesis, claim.names = named, names
+                claim.gap, claim.log_odds = gap, odds
             driver = named.course.driver
-            claim.of_driver[driver] = max(claim.of_driver.get(driver, -np.inf), float(odds))
+            if driver not in claim.of_driver or odds > claim.of_driver[driver][0]:
+                claim.of_driver[driver] = odds, named
 
     scene, found = before.scene, []
     refined = _at(tests.battery.families, effect)
@@ -147,10 +153,10 @@ def _foremost(ordered: list[Rival]) -> list[Rival]:
 
 def _rival(claim: _Claim, weight: float, driver: str = "") -> Rival:
     first = driver or claim.hypothesis.course.driver
-    best = max(claim.of_driver.values())
-    others = sorted(claim.of_driver, key=lambda d: -claim.of_driver[d])
-    near = [d for d in others if d != first and claim.of_driver[d] > best - np.log(_ODDS)]
-    return Rival(claim.hypothesis, claim.gap, weight, tuple(near))
+    ordered = sorted(claim.of_driver.values(), key=lambda known: -known[0])
+    least = ordered[0][0] - np.log(_ODDS)
+    near = [h for odds, h in ordered if h.course.driver != first and odds > least]
+    return Rival(claim.hypothesis, claim.gap, weight, tuple(near), claim.names)
 
 
 def _claim_of(hypothesis: Hypothesis) -> tuple:

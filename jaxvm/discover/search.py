@@ -260,7 +260,7 @@ class Search:
             final_effect=chosen.effect,
             final_stds=(),
             weight=chief.weight,
-            drivers=chief.drivers,
+            others=chief.others,
             rivals=tuple(doubles),
             p_value=self.p_value,
             p_independent=self.p_value,
@@ -391,7 +391,7 @@ class Search:
             shown,
             finding.noise,
         )
-        return replace(finding, weight=chief.weight, drivers=chief.drivers, rivals=tuple(doubles))
+        return replace(finding, weight=chief.weight, others=chief.others, rivals=tuple(doubles))
 
     def _drop_unconfirmed(self) -> None:
         effects = self.current.scene.fitted_effects()

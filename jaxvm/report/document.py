@@ -78,7 +78,7 @@ def _finding(finding: Finding) -> dict[str, Any]:
         "p_value": finding.p_value,
         "n_hypotheses": finding.n_hypotheses,
         "weight": finding.weight,
-        "other_drivers": list(finding.drivers),
+        "other_drivers": [h.course.driver for h in finding.others],
         "equivalents": [_rival(rival) for rival in finding.rivals],
         "nearly_as_good": [h.effect(()).name for h in finding.doubles],
         "separate_by": separate_by(finding),
@@ -113,7 +113,7 @@ def _rival(rival: Rival) -> dict[str, Any]:
         "form": effect.form,
         "where": effect.scope.as_dict(),
         "weight": rival.weight,
-        "other_drivers": list(rival.drivers),
+        "other_drivers": [h.course.driver for h in rival.others],
     }
 
 
