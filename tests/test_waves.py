@@ -18,6 +18,9 @@ from jaxvm.physics.effects import Effect, Scope
 from jaxvm.recording import Camera, Model, Observations, Recording, Station, Target
 from jaxvm.recording.model import grid_names
 from jaxvm.report import summary
+from jaxvm.report.document import document
+from jaxvm.report.figures import figures, png
+from jaxvm.report.page import html
 
 IMAGE, SIGMA, N_EPOCHS, SPACING = (1280, 960), 0.05, 30, 60.0
 MARKS = grid_points(7, 9, 0.11) - [0.44, 0.33, 0.0]
@@ -176,4 +179,61 @@ def test_what_every_camera_has_for_itself_is_told_and_not_claimed(pair):
     found = diagnose(replace(recorded(pair, jumps[obs.camera, obs.epoch]), model=known))
     assert found.verdict == "unexplained" and not found.findings
     assert found.likeness > ALIKE
-    assert "haze" in summary(found)
+    assert "haze" in summary(found) and found.signal is None
+
+
+def turbulent(recording: Recording, size: float, length: float, share: float, seed: int):
+    """A random field in every image [observations, 2] (px), of which the next keeps a share."""
+    obs, rng = recording.observations, np.random.default_rng(seed)
+    found = np.zeros(obs.pixel.shape)
+    for camera in range(len(recording.model.cameras)):
+        last = None
+        for epoch in range(N_EPOCHS):
+            own = (obs.camera == camera) & (obs.epoch == epoch)
+            apart = np.linalg.norm(obs.pixel[own][:, None] - obs.pixel[own], axis=-1)
+            root = np.linalg.cholesky(
+                np.exp(-((apart / length) ** (5 / 3))) + 1e-9 * np.eye(own.sum())
+            )
+            drawn = size * root @ rng.standard_normal((own.sum(), 2))
+            last = drawn if last is None else share * last + np.sqrt(1.0 - share**2) * drawn
+            found[own] = last
+    return found
+
+
+def test_shimmering_air_is_named_and_measured(pair):
+    """A field that falls off over 250 px, before a plate that is known."""
+    known = replace(pair.model, targets=(replace(pair.model.targets[0], free=()),))
+    change = turbulent(pair, 0.06, 250.0, 0.0, 8)
+    found = diagnose(replace(recorded(pair, change), model=known))
+    signal = found.signal
+    assert signal is not None and not found.findings
+    assert found.verdict == "explained" and "the air shimmers" in summary(found)
+    assert signal.cameras == (0, 1)
+    assert np.abs(signal.size_rad - 0.06 / 1100.0).max() < 4.0 * signal.size_stds_rad.max()
+    assert signal.size_stds_rad.max() < 0.2 * 0.06 / 1100.0
+    assert 125.0 < signal.length_px < 500.0
+    assert abs(signal.lasting) < 0.3
+    # Of the excess some is left: neighbours have noise, too.
+    before, after = found.plain.heldout_rms_px, found.final.heldout_rms_px
+    assert before == pytest.approx(np.hypot(SIGMA, 0.06), rel=0.1)
+    assert SIGMA < after < 0.9 * before
+    (told,) = document(found)["findings"]
+    assert told["catalogue_id"] == "haze" and told["rows"] == [18, 98]
+    pictures = {f"{name}.png": png(figure) for name, figure in figures(found).items()}
+    assert "signal.png" in pictures and "the air shimmers" in html(found, pictures)
+
+
+def test_what_lasts_is_no_haze(pair):
+    """A field that goes on from image to image is a deformation."""
+    known = replace(pair.model, targets=(replace(pair.model.targets[0], free=()),))
+    change = turbulent(pair, 0.06, 250.0, 0.95, 9)
+    found = diagnose(replace(recorded(pair, change), model=known))
+    assert found.signal is None and found.verdict != "consistent"
+
+
+def test_what_one_camera_has_is_no_haze(pair):
+    known = replace(pair.model, targets=(replace(pair.model.targets[0], free=()),))
+    change = turbulent(pair, 0.06, 250.0, 0.0, 10)
+    change[pair.observations.camera == 0] = 0.0
+    found = diagnose(replace(recorded(pair, change), model=known))
+    assert found.signal is None

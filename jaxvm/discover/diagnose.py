@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from jaxvm.discover.advice import advise
+from jaxvm.discover.collocation import collocate
 from jaxvm.discover.constants import other_instants, run_away
 from jaxvm.discover.diagnosis import Diagnosis, Finding, Quality
 from jaxvm.discover.first_states import with_first_states
@@ -85,7 +86,11 @@ def diagnose(
     final = everything.fit(current.scene)
     final = _with_best_instants(final, parts.sound)
     final = _with_first_states(final, parts.sound)
-    excess = 2.0 * plain.cost - current.variance_factor * plain.degrees_of_freedom
+    signal = collocate(current, found.heldout, parts, seed)
+    heldout = found.heldout if signal is None else signal.heldout
+    # Share of chi-square that is left when the signal is foretold.
+    kept = 1.0 if signal is None else 1.0 - 0.5 * signal.drop / current.cost
+    excess = 2.0 * plain.cost - kept * current.variance_factor * plain.degrees_of_freedom
     findings = [replace(f, share=float(f.drop / max(excess, 1e-9))) for f in findings]
     findings = _with_final_values(final, findings, len(effects), parts.sound)
     findings = [
@@ -97,15 +102,15 @@ def diagnose(
     findings = [_with_advice(final, f, len(effects) + k, parts) for k, f in enumerate(findings)]
     before = _table(plain, plain_heldout, scene, parts.sound)
     after = _table(final, None, scene, parts.sound)
-    noise = np.sqrt(robust_variance(final)) * reference_sigma(scene)
+    noise = np.sqrt(kept * robust_variance(final)) * reference_sigma(scene)
     alike = likeness(current.scene, parts.residuals(current))
-    significant = found.p_value <= alpha or alike > ALIKE
+    significant = found.p_value <= alpha or (alike > ALIKE and signal is None)
     return Diagnosis(
         recording=recording,
-        verdict=_verdict(findings, significant),
+        verdict=_verdict(len(findings) + (signal is not None), significant),
         noise_px=float(noise),
         plain=_quality(plain, plain_heldout),
-        final=_quality(current, found.heldout),
+        final=_quality(current, heldout, kept),
         findings=tuple(findings),
         significant_left=significant,
         left_p_value=found.p_value,
@@ -115,8 +120,10 @@ def diagnose(
         after=after,
         held=parts.held,
         heldout_before=plain_heldout,
-        heldout_after=found.heldout,
+        heldout_after=heldout,
         scene=final.scene,
+        signal=signal,
+        signal_share=0.0 if signal is None else float(signal.drop / max(excess, 1e-9)),
         likeness=alike,
         n_rejected=n_rejected,
         n_hypotheses=found.ranking.n,
@@ -236,15 +243,15 @@ def _table(fitted: Adjustment, heldout: HeldOut | None, scene: Scene, sound) -> 
     return residual_table(scene, completed.residuals().pixels, sound, reference)
 
 
-def _quality(fitted: Adjustment, heldout: HeldOut) -> Quality:
+def _quality(fitted: Adjustment, heldout: HeldOut, kept: float = 1.0) -> Quality:
     square = sum(float(np.sum(np.asarray(b) ** 2)) for b in fitted.residuals().pixels)
     count = sum(2.0 * float(np.sum(np.asarray(f.weight) > 0))
                 for f in fitted.problem.network.pixels)  # fmt: skip
-    rms = np.sqrt(square / count) * reference_sigma(fitted.scene)
-    return Quality(float(rms), heldout.rms_px, fitted.variance_factor)
+    rms = np.sqrt(kept * square / count) * reference_sigma(fitted.scene)
+    return Quality(float(rms), heldout.rms_px, kept * fitted.variance_factor)
 
 
-def _verdict(findings: list[Finding], significant: bool) -> str:
-    if not findings:
+def _verdict(n: int, significant: bool) -> str:
+    if not n:
         return "unexplained" if significant else "consistent"
     return "partly explained" if significant else "explained"

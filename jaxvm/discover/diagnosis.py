@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from jaxvm.discover.advice import Advice
+from jaxvm.discover.collocation import Signal
 from jaxvm.discover.heldout import Gain, HeldOut
 from jaxvm.discover.hypotheses import Hypothesis
 from jaxvm.discover.locate import Place, ResidualTable
@@ -95,6 +96,8 @@ class Diagnosis:
         held: epochs that were set aside.
         heldout_before, heldout_after: squares by held-out epoch.
         scene: the last model, fitted to all epochs.
+        signal: what the marks of an image share at random; None where nothing is proven.
+        signal_share: of the plain model's excess chi-square that the signal explains.
         likeness: correlation of neighbouring marks in one image, of what is left.
         n_rejected: gross errors set aside.
         n_hypotheses: hypotheses in the last round.
@@ -119,6 +122,8 @@ class Diagnosis:
     heldout_before: HeldOut
     heldout_after: HeldOut
     scene: Scene
+    signal: Signal | None
+    signal_share: float
     likeness: float
     n_rejected: int
     n_hypotheses: int

@@ -7,6 +7,7 @@ neighbouring marks move clearly alike, or (a zoom) not at all, not where they mo
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -26,6 +27,9 @@ ALIKE = 0.15
 MOST_IMAGES = 400
 """Epochs up to which each can have an amount of its own."""
 
+_FAR = 1e6
+"""Distance (px) between images, where all marks are sorted at once."""
+
 _ALSO = 0.2
 """Share of the leading evidence from which another camera errs at random, too."""
 
@@ -40,21 +44,13 @@ def likeness(scene: Scene, residual: np.ndarray) -> float:
         residual: whitened residuals [observations, 2] in the order of the recording, NaN where not
             fitted.
     """
-    obs = scene.recording.observations
-    used = np.flatnonzero(np.isfinite(residual).all(axis=1))
-    if len(used) < 50:
+    near = neighbours(scene, residual, 1)
+    if len(near.rows) < 50:
         return 0.0
-    # A third axis, far longer than the image, keeps images apart.
-    n_targets = len(scene.model.targets)
-    image = (obs.epoch * len(scene.model.cameras) + obs.camera) * n_targets + obs.target
-    at = np.column_stack([obs.pixel[used], 1e6 * image[used]])
-    distance, nearest = (np.asarray(found)[:, 1] for found in KDTree(at).query(at, k=2))
-    pairs = distance < 1e6
-    own, other = residual[used][pairs], residual[used[nearest[pairs]]]
-    camera = obs.camera[used][pairs]
-    # Gross errors and the tails of the noise shall not decide.
-    limit = 4.0 * np.median(np.abs(residual[used])) / 0.67449
-    own, other = np.clip(own, -limit, limit), np.clip(other, -limit, limit)
+    error = clipped(residual[near.rows])
+    paired = near.known[:, 0]
+    own, other = error[paired], error[near.nearest[paired, 0]]
+    camera = scene.recording.observations.camera[near.rows][paired]
     return max(
         (_correlation(own[camera == c], other[camera == c]) for c in set(camera)), default=0.0
     )
@@ -66,6 +62,46 @@ def _correlation(own: np.ndarray, other: np.ndarray) -> float:
         return 0.0
     value = float(np.mean(own * other) / np.mean(own**2))
     return value if value > 5.0 / np.sqrt(own.size) else 0.0
+
+
+def clipped(residual: np.ndarray) -> np.ndarray:
+    """Residuals without their tails: gross errors shall not decide."""
+    limit = 4.0 * np.median(np.abs(residual)) / 0.67449
+    return np.clip(residual, -limit, limit)
+
+
+@dataclass(frozen=True)
+class Neighbours:
+    """Marks and the nearest ones of the same target in the same image.
+
+    Attributes:
+        rows: of the recording, whose residuals are known.
+        at: place of each in its image (px), [marks, 2].
+        nearest: their numbers among these rows, the nearest first; 0 where an image has fewer.
+        known: whether there is one.
+        distance: to them (px).
+    """
+
+    rows: np.ndarray
+    at: np.ndarray
+    nearest: np.ndarray
+    known: np.ndarray
+    distance: np.ndarray
+
+
+def neighbours(scene: Scene, residual: np.ndarray, most: int) -> Neighbours:
+    """Marks with residuals [observations, 2] that are not NaN, and up to so many around each."""
+    obs = scene.recording.observations
+    rows = np.flatnonzero(np.isfinite(residual).all(axis=1))
+    # A third axis, far longer than the image, keeps images apart.
+    n_targets = len(scene.model.targets)
+    image = (obs.epoch * len(scene.model.cameras) + obs.camera) * n_targets + obs.target
+    at = np.column_stack([obs.pixel[rows], _FAR * image[rows]])
+    distance, nearest = (np.asarray(f)[:, 1:] for f in KDTree(at).query(at, k=most + 1))
+    known = distance < _FAR
+    return Neighbours(
+        rows, at[:, :2], np.where(known, nearest, 0), known, np.where(known, distance, 0.0)
+    )
 
 
 def of_each_image(

@@ -4,11 +4,21 @@ from typing import Any
 
 import numpy as np
 
+from jaxvm.discover.collocation import Signal
 from jaxvm.discover.diagnosis import Diagnosis, Finding
 from jaxvm.discover.rivals import Rival
 from jaxvm.discover.shape import shape_words
 from jaxvm.physics.catalogue import BY_ID
-from jaxvm.report.words import Parameter, explanation, parameters, separate_by, when
+from jaxvm.report.words import (
+    HAZE,
+    SIGNAL_WHEN,
+    Parameter,
+    explanation,
+    parameters,
+    separate_by,
+    signal_parameters,
+    when,
+)
 
 FORMAT = 1
 
@@ -22,7 +32,10 @@ def document(diagnosis: Diagnosis) -> dict[str, Any]:
         "noise_px": diagnosis.noise_px,
         "plain": vars(diagnosis.plain),
         "final": vars(diagnosis.final),
-        "findings": [_finding(finding) for finding in diagnosis.findings],
+        "findings": [
+            *(_finding(finding) for finding in diagnosis.findings),
+            *(_signal(signal, diagnosis) for signal in [diagnosis.signal] if signal),
+        ],
         "left_over": {
             "significant": diagnosis.significant_left,
             "p_value": diagnosis.left_p_value,
@@ -99,6 +112,43 @@ def _finding(finding: Finding) -> dict[str, Any]:
         "heldout_rms_px": {"before": gain.before_px, "after": gain.after_px},
         "heldout_share": {"value": gain.share, "interval_95": list(gain.interval)},
         "ranking": [{"hypothesis": words, "evidence": e} for words, e in finding.ranking],
+    }
+
+
+def _signal(signal: Signal, diagnosis: Diagnosis) -> dict[str, Any]:
+    """What the marks of an image share at random, with the keys of a finding."""
+    values, gain = _parameters(signal_parameters(signal, diagnosis)), signal.gain
+    return {
+        "physics": HAZE.physics,
+        "catalogue_id": HAZE.id,
+        "rows": list(HAZE.rows),
+        "named": True,
+        "port": "medium.bend_u",
+        "terms": [
+            {"port": port, "pattern": "place in the image", "basis": "covariance"}
+            for port in ("medium.bend_u", "medium.bend_v")
+        ],
+        "driver": "image",
+        "form": "random",
+        "where": {},
+        "when": SIGNAL_WHEN,
+        "shape": "",
+        "parameters": values,
+        "final_parameters": values,
+        "share_of_excess": diagnosis.signal_share,
+        "p_value": signal.p_value,
+        "n_hypotheses": 1,
+        "weight": 1.0,
+        "other_drivers": [],
+        "equivalents": [],
+        "nearly_as_good": [],
+        "separate_by": HAZE.separate_by,
+        "advice": [],
+        "shared": "",
+        "explanation": HAZE.explanation,
+        "heldout_rms_px": {"before": gain.before_px, "after": gain.after_px},
+        "heldout_share": {"value": gain.share, "interval_95": list(gain.interval)},
+        "ranking": [],
     }
 
 

@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from jaxvm.discover.collocation import Signal
 from jaxvm.discover.diagnosis import Diagnosis, Finding
 from jaxvm.discover.locate import ResidualTable
 from jaxvm.physics.catalogue.entry import HYSTERESIS
@@ -39,6 +40,8 @@ def figures(diagnosis: Diagnosis) -> dict[str, Figure]:
         for number, finding in enumerate(diagnosis.findings, start=1):
             made[f"finding_{number}_evidence"] = evidence_figure(diagnosis, finding)
             made[f"finding_{number}_ranking"] = ranking_figure(finding)
+        if diagnosis.signal is not None:
+            made["signal"] = signal_figure(diagnosis.signal)
     return made
 
 
@@ -141,9 +144,11 @@ def heldout_quality(diagnosis: Diagnosis) -> Figure:
     steps = [("plain model", diagnosis.plain.heldout_rms_px)]
     for number, finding in enumerate(diagnosis.findings, start=1):
         steps.append((f"+ finding {number}", finding.gain.after_px))
+    if diagnosis.signal is not None:
+        steps.append((f"+ finding {len(steps)}", diagnosis.signal.gain.after_px))
     figure, axes = _figure(9.0, 3.2, 2, width_ratios=(1.0, 1.5))
     left, right = axes[0]
-    colours = [BEFORE, *[AFTER] * len(diagnosis.findings)]
+    colours = [BEFORE, *[AFTER] * (len(steps) - 1)]
     bars = left.bar(range(len(steps)), [v for _, v in steps], color=colours, width=0.62)
     left.bar_label(bars, fmt="%.3f", padding=2)
     left.axhline(diagnosis.noise_px, color=INK, ls=":", lw=1.0, label="noise, robust")
@@ -157,7 +162,7 @@ def heldout_quality(diagnosis: Diagnosis) -> Figure:
         (diagnosis.heldout_before, BEFORE, "before"),
         (diagnosis.heldout_after, AFTER, "after"),
     ):
-        if not diagnosis.findings and name == "after":
+        if len(steps) == 1 and name == "after":
             continue
         rms = np.sqrt(heldout.square / np.maximum(heldout.count, 1.0)) * scale
         right.plot(ids, rms, "o-", ms=3, lw=0.8, color=colour, label=name)
@@ -185,6 +190,23 @@ def histogram(diagnosis: Diagnosis) -> Figure:
     normal = np.exp(-0.5 * (edges / noise) ** 2) / (noise * np.sqrt(2.0 * np.pi))
     axis.plot(edges, normal, color=INK, ls=":", lw=1.0, label=f"normal, {noise:.3f} px")
     axis.set(xlabel="residual of a pixel coordinate (px)", ylabel="density (1/px)")
+    axis.legend()
+    return figure
+
+
+def signal_figure(signal: Signal) -> Figure:
+    """Mean product of the errors of two marks of one image against their distance."""
+    figure, axes = _figure(9.0, 2.8)
+    axis: Axes = axes[0, 0]
+    distance, before, after = signal.by_distance.T
+    axis.axhline(0.0, color=INK, ls=":", lw=1.0)
+    axis.plot(distance, before, "o-", ms=4, color=BEFORE, label="before")
+    axis.plot(distance, after, "o-", ms=4, color=AFTER, label="less what the marks around foretell")
+    axis.set(
+        xlabel="distance of two marks of one image (px)",
+        ylabel="product of errors\n(sigma squared)",
+        title="what neighbouring marks share",
+    )
     axis.legend()
     return figure
 

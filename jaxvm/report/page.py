@@ -15,6 +15,7 @@ from jaxvm.recording.write import model_text
 from jaxvm.report.document import document
 from jaxvm.report.figures import figures, png
 from jaxvm.report.words import (
+    HAZE,
     doubles,
     explanation,
     in_pixels,
@@ -24,6 +25,7 @@ from jaxvm.report.words import (
     parameters,
     quantity,
     separate_by,
+    signal_rows,
     size,
     verdict_sentence,
     when,
@@ -67,6 +69,8 @@ def html(diagnosis: Diagnosis, pictures: dict[str, bytes]) -> str:
         "quantity": quantity,
         "shape_words": shape_words,
         "separate_by": separate_by,
+        "signal_rows": signal_rows(diagnosis),
+        "haze": HAZE,
         "size": size,
         "when": when,
     }

@@ -6,9 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jaxvm.discover.collocation import Signal
 from jaxvm.discover.diagnosis import Diagnosis, Finding
 from jaxvm.discover.scatter import ALIKE
 from jaxvm.discover.shape import shape_words
+from jaxvm.physics.catalogue import BY_ID
 from jaxvm.physics.drivers import channel_unit
 from jaxvm.physics.effects import Effect
 from jaxvm.physics.forms import FORMS
@@ -19,6 +21,11 @@ _HOPELESS = 0.05
 """Chance to decide below which a further recording is no advice."""
 
 _PORT = {port.name: port for port in PORTS}
+
+HAZE = BY_ID["haze"]
+"""What a random signal that the marks of an image share is called."""
+
+SIGNAL_WHEN = "in every image anew, alike for neighbouring marks"
 
 _PER_DRIVER = {
     "linear": 1,
@@ -212,6 +219,46 @@ def odds(value: float) -> str:
     return f"{value:.1f}:1" if value < 10.0 else f"{min(value, 1e6):,.0f}:1"
 
 
+def signal_parameters(signal: Signal, diagnosis: Diagnosis) -> list[Parameter]:
+    """Numbers of what the marks of an image share at random."""
+    cameras = diagnosis.recording.model.cameras
+    sizes = zip(signal.cameras, signal.size_rad, signal.size_stds_rad, strict=True)
+    return [
+        *(
+            Parameter(f"tilt of the rays, {cameras[c].name}", float(value), float(std), "rad")
+            for c, value, std in sizes
+        ),
+        Parameter("correlation length", signal.length_rad, 0.0, "rad"),
+    ]
+
+
+def signal_rows(diagnosis: Diagnosis) -> list[tuple[str, str]]:
+    """What the report says of it, as (title, words); empty without."""
+    signal = diagnosis.signal
+    if signal is None:
+        return []
+    gain, values = signal.gain, signal_parameters(signal, diagnosis)
+    sizes = "; ".join(f"{p.name} {quantity(p.value, p.std, p.unit)}" for p in values)
+    low, high = (100 * bound for bound in gain.interval)
+    return [
+        ("where", "everywhere; seen by the cameras that are named with their sizes"),
+        ("when", SIGNAL_WHEN),
+        ("size", f"{sizes} (standard deviations of single images)"),
+        (
+            "explains",
+            f"{100 * diagnosis.signal_share:.0f} % of the excess chi-square by what the marks "
+            f"around foretell; p = {signal.p_value:.2g}; the next epoch keeps "
+            f"{100 * signal.lasting:.0f} % of it",
+        ),
+        (
+            "proof",
+            f"held-out {gain.before_px:.4f} px -> {gain.after_px:.4f} px "
+            f"({low:.1f} to {high:.1f} % of chi-square, 95 %)",
+        ),
+        ("separate", HAZE.separate_by),
+    ]
+
+
 def explanation(finding: Finding) -> str:
     """Two sentences for an engineer."""
     entries = finding.hypothesis.entries
@@ -233,10 +280,10 @@ def verdict_sentence(diagnosis: Diagnosis) -> str:
             f"(family-wise {p})."
         )
     if diagnosis.verdict == "explained":
-        found = _count(len(diagnosis.findings))
+        found = _count(_n_found(diagnosis))
         return f"{found}; after that none of {tried} is significant (family-wise {p})."
     left = f"Something significant is left ({p})"
-    if diagnosis.likeness > ALIKE:
+    if diagnosis.likeness > ALIKE and diagnosis.signal is None:
         left = (
             f"What is left moves neighbouring marks of one image alike (correlation "
             f"{diagnosis.likeness:.2f}), at random from image to image or in a pattern that is "
@@ -249,7 +296,11 @@ def verdict_sentence(diagnosis: Diagnosis) -> str:
         )
     if diagnosis.verdict == "unexplained":
         return f"The recording differs from its model, but nothing passes the proof. {left}."
-    return f"{_count(len(diagnosis.findings))}. {left}."
+    return f"{_count(_n_found(diagnosis))}. {left}."
+
+
+def _n_found(diagnosis: Diagnosis) -> int:
+    return len(diagnosis.findings) + (diagnosis.signal is not None)
 
 
 def _count(n: int) -> str:
@@ -296,6 +347,9 @@ def summary(diagnosis: Diagnosis) -> str:
             lines.append(f"   separate  {separate_by(finding)}")
         if nearly_as_good(finding):
             lines.append(f"   nearly    {nearly_as_good(finding)}  [fitted a little worse]")
+    if diagnosis.signal is not None:
+        lines += ["", f"{len(diagnosis.findings) + 1}. {HAZE.physics}"]
+        lines += [f"   {title:<9} {words}" for title, words in signal_rows(diagnosis)]
     located = diagnosis.located_left if diagnosis.findings else diagnosis.located_before
     if located and diagnosis.significant_left:
         lines += ["", "left over  " + "; ".join(place.words() for place in located[:3])]
