@@ -247,8 +247,8 @@ def signal_rows(diagnosis: Diagnosis) -> list[tuple[str, str]]:
         (
             "explains",
             f"{100 * diagnosis.signal_share:.0f} % of the excess chi-square by what the marks "
-            f"around foretell; p = {signal.p_value:.2g}; the next epoch keeps "
-            f"{100 * signal.lasting:.0f} % of it",
+            f"around foretell; p = {signal.p_value:.2g}; correlation with the next "
+            f"image {signal.lasting:.2f}",
         ),
         (
             "proof",
