@@ -91,11 +91,11 @@ def collocate(fitted: Adjustment, heldout: HeldOut, parts: Split, seed: int = 0)
         seed: of the bootstrap.
     """
     scene = fitted.scene
+    n_cameras = len(scene.model.cameras)
     whitened = parts.residuals(fitted)
-    if likeness(scene, whitened) <= ALIKE:
+    if n_cameras < 2 or likeness(scene, whitened) <= ALIKE:
         return None
     marks = _Marks.of(scene, whitened)
-    n_cameras = len(scene.model.cameras)
     common, length = _covariance(marks, _lengths(marks))
     shown = _Shown.of(marks, np.full(n_cameras, common), length)
     whole, far = _covariance(marks, np.array([_WHOLE]))
@@ -211,7 +211,7 @@ class _Shown:
 
     Attributes:
         marks: the marks.
-        foretold: error [marks, 2].
+        foretold: errors [marks, 2].
         per_variance: expected product for a signal of variance 1.
     """
 
@@ -245,19 +245,18 @@ class _Shown:
 
         The images are independent of each other: their scatter tells how well it is known.
         """
-        epoch, n = (
-            scene.recording.observations.epoch[self.marks.near.rows],
-            len(scene.recording.time),
-        )
+        n = len(scene.recording.time)
+        epoch = scene.recording.observations.epoch[self.marks.near.rows]
         product = np.sum(self.marks.error * self.foretold, axis=1)
         variances, stds = np.zeros((2, len(scene.model.cameras)))
         for c in set(self.marks.camera):
             mine = self.marks.camera == c
             products = np.bincount(epoch[mine], product[mine], n)
             expected = np.bincount(epoch[mine], self.per_variance[mine], n)
-            variances[c] = products.sum() / expected.sum()
-            left = products - variances[c] * expected
-            stds[c] = np.sqrt(np.sum(left**2)) / expected.sum()
+            if expected.sum() > 0.0:
+                variances[c] = products.sum() / expected.sum()
+                left = products - variances[c] * expected
+                stds[c] = np.sqrt(np.sum(left**2)) / expected.sum()
         return variances, stds
 
     def lasting(self, scene: Scene, cameras: tuple[int, ...]) -> float:
