@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxvm.discover.advice import advise
 from jaxvm.discover.collocation import collocate
-from jaxvm.discover.constants import other_instants, run_away
+from jaxvm.discover.constants import run_away
 from jaxvm.discover.diagnosis import Diagnosis, Finding, Quality
 from jaxvm.discover.first_states import with_first_states
 from jaxvm.discover.gross import without_gross_errors
@@ -24,6 +24,7 @@ from jaxvm.discover.heldout import (
     split,
 )
 from jaxvm.discover.inputs import variances_by_inputs
+from jaxvm.discover.instants import at_best_instants, with_spread
 from jaxvm.discover.locate import ResidualTable, locate, residual_table
 from jaxvm.discover.noise import Correlation, met
 from jaxvm.discover.scatter import ALIKE, likeness
@@ -84,7 +85,7 @@ def diagnose(
     progress("final fit to all epochs")
     everything = split(scene, np.zeros(len(parts.held), bool), parts.sound)
     final = everything.fit(current.scene)
-    final = _with_best_instants(final, parts.sound)
+    final, instants = at_best_instants(final, findings, len(effects), parts.sound)
     final = _with_first_states(final, parts.sound)
     signal = collocate(current, found.heldout, parts, seed)
     heldout = found.heldout if signal is None else signal.heldout
@@ -93,6 +94,7 @@ def diagnose(
     excess = 2.0 * plain.cost - kept * current.variance_factor * plain.degrees_of_freedom
     findings = [replace(f, share=float(f.drop / max(excess, 1e-9))) for f in findings]
     findings = _with_final_values(final, findings, len(effects), parts.sound)
+    findings = [with_spread(f, own) for f, own in zip(findings, instants, strict=True)]
     findings = [
         replace(f, sharing=sharing(current, len(effects) + k, parts))
         for k, f in enumerate(findings)
@@ -171,19 +173,6 @@ def _room(effects: tuple[Effect, ...]) -> tuple[int, int]:
     """Room for the effects given and those to be found; the same for few of them."""
     columns, constants = capacity(effects)
     return max(ROOM[0], columns + 8), max(ROOM[1], constants + 3)
-
-
-def _with_best_instants(final: Adjustment, weights) -> Adjustment:
-    """The final fit with every step at the instant that all epochs prefer.
-
-    The fitted epochs alone leave open on which side an epoch between two of them lies.
-    """
-    everywhere = np.zeros(len(final.scene.recording.time), bool)
-    for scene in other_instants(final.scene, everywhere):
-        tried = adjust(scene, weights=weights, rtol=1e-8, check=False)
-        if tried.cost < final.cost:
-            final = tried
-    return final
 
 
 def _with_first_states(final: Adjustment, weights) -> Adjustment:
