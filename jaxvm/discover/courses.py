@@ -201,9 +201,14 @@ def _of_clock(driver: str, channels: Channels, lags: list[float]) -> list[Course
 
 
 def _of_power_on(driver: str, channels: Channels, lags: list[float]) -> list[Course]:
-    """Time since a camera was switched on: its parts warm up one after the other."""
+    """Time since a camera was switched on."""
+    return [*_of_clock(driver, channels, lags), *_warming_up(driver, lags)]
+
+
+def _warming_up(driver: str, lags: list[float]) -> list[Course]:
+    """What a camera that was calibrated warm shows until it is: its parts, one after the other."""
     return [
-        *_of_clock(driver, channels, lags),
+        *(Course(driver, "fading", (tau,)) for tau in lags),
         *(Course(driver, "two decays", pair) for pair in zip(lags, lags[2:], strict=False)),
     ]
 
@@ -218,6 +223,8 @@ def _of_time(driver: str, channels: Channels, lags: list[float]) -> list[Course]
     periods = span / np.arange(1.0, min(span / (2.05 * _spacing(channels)), 34.0), 0.5)
     return [
         *_of_clock(driver, channels, lags),
+        # Named only where nobody noted when the cameras were switched on.
+        *_warming_up(driver, lags),
         Course(driver, "linear", (), _reference(driver, channels)),
         Course(driver, "proportional"),
         *(Course(driver, "step", (t,)) for t in instants.tolist()),

@@ -29,6 +29,9 @@ No effect follows its driver quite as a form says. Where chi-square runs to ten 
 remainder outweighs any odds between rivals that differ by less than that.
 """
 
+_ALIKE = 0.1
+"""Difference of foretold evidence of two forms that say the same."""
+
 CLEAR = 15.0
 """Difference of foretold evidence between two courses of the same terms that a refit won't turn."""
 
@@ -168,11 +171,16 @@ def shortlist(
         # become so on a finer grid.
         place = (hypothesis.group, hypothesis.scope)
         key = (identity(hypothesis), hypothesis.course.form)
+        # What settles and what fades are one where the model has a constant of its own beside them.
+        at = (identity(hypothesis), hypothesis.course.constants)
+        alike = abs(seen.get(at, np.inf) - own) < _ALIKE
         is_behind = seen.get(place, own) - own > CLEAR
+        if alike:
+            seen.setdefault(key, own)
         if key in seen or (is_behind and hypothesis.course.form not in SOUGHT):
             continue
         seen.setdefault(place, own)
-        seen[key] = own
+        seen[key] = seen[at] = own
         behind += is_behind
         chosen.append((hypothesis, own, amplitudes))
         if len(chosen) - min(behind, count) == count:

@@ -45,6 +45,7 @@ NAMED_ONLY = (
     "ageing",
     "staircase",
     "doubling",
+    "fading",
     "two decays",
     "direction",
 )

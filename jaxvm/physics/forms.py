@@ -270,6 +270,7 @@ FORMS: dict[str, Form] = {
             centred=True,
         ),
         Form("onset", ("onset",), (_TAU,), "settling exponentially with {driver}"),
+        Form("fading", ("decay",), (_TAU,), "fading exponentially with {driver}"),
         Form(
             "two decays",
             ("decay", "slow decay"),

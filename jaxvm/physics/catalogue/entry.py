@@ -55,6 +55,9 @@ THERMAL = ("linear", "lag", "lag with state", "delay", "two lags", "affine", "af
 CHANGING = ("rate", "transient", "transient with state")
 """Forms of what follows the rate of a quantity, at once or late."""
 
+WARMING_UP = ("onset", "fading", "two decays")
+"""Forms of what settles after power-on: calibrated cold, or calibrated warm and recorded cold."""
+
 SETTLING = ("linear", "proportional", "onset", "creep", "ramp", "settling")
 """Forms of what moves slowly one way."""
 

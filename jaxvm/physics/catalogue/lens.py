@@ -4,6 +4,7 @@ from jaxvm.physics.catalogue.entry import (
     ALWAYS,
     HYSTERESIS,
     THERMAL,
+    WARMING_UP,
     Entry,
     Terms,
     each,
@@ -95,7 +96,7 @@ LENS: tuple[Entry, ...] = (
     ),
     Entry(
         "focal-warm-up", "the focal length settles after power-on", (52,),
-        _FOCAL, ("power-on",), ("onset",), "camera",
+        _FOCAL, ("power-on",), WARMING_UP, "camera",
         (1e-5, 1e-2), "ambient temperature", "switch off and on again",
         "The camera heats itself after power-on and its principal distance settles. It starts "
         "again with every power-on.",
@@ -158,7 +159,7 @@ LENS: tuple[Entry, ...] = (
     ),
     Entry(
         "distortion-warm-up", "the distortion settles after power-on", (43,),
-        _RADIAL, ("power-on",), ("onset",), "camera",
+        _RADIAL, ("power-on",), WARMING_UP, "camera",
         (1e-5, 1e-2), "settling of the focal length", "targets out to the edge of the field",
         "The camera heats its lens after power-on and the distortion settles. The edge of the "
         "field moves more than in proportion.",

@@ -6,6 +6,7 @@ from jaxvm.physics.catalogue.entry import (
     HYSTERESIS,
     SETTLING,
     THERMAL,
+    WARMING_UP,
     Entry,
     axes,
 )
@@ -81,7 +82,7 @@ MOUNT: tuple[Entry, ...] = (
     ),
     Entry(
         "mount-warm-up", "the camera turns in its mount after power-on", (25, 52),
-        _TURN, ("power-on",), ("onset",), "camera",
+        _TURN, ("power-on",), WARMING_UP, "camera",
         (1e-5, 2e-3), "shift of the sensor, creep", "switch off and on again",
         "The camera heats its own mount and turns in it. The turn settles exponentially and "
         "returns with every power-on.",

@@ -1,6 +1,15 @@
 """Named physics of sensors, shutters and clocks."""
 
-from jaxvm.physics.catalogue.entry import ALWAYS, HYSTERESIS, THERMAL, Entry, each, pair, plain
+from jaxvm.physics.catalogue.entry import (
+    ALWAYS,
+    HYSTERESIS,
+    THERMAL,
+    WARMING_UP,
+    Entry,
+    each,
+    pair,
+    plain,
+)
 from jaxvm.physics.catalogue.maps import height_map
 from jaxvm.physics.effects import Term
 
@@ -48,7 +57,7 @@ SENSOR: tuple[Entry, ...] = (
     ),
     Entry(
         "self-heating", "the image shifts after power-on", (52,),
-        _CENTRE, ("power-on",), ("onset", "two decays"), "camera",
+        _CENTRE, ("power-on",), WARMING_UP, "camera",
         (2e-2, 5.0), "ambient temperature, creep", "switch off and on again",
         "The camera heats itself after power-on and the sensor moves. The shift settles "
         "exponentially and returns with every power-on.",
