@@ -11,11 +11,11 @@ import numpy as np
 
 from jaxvm.discover.constants import sensible
 from jaxvm.discover.diagnosis import Finding
-from jaxvm.discover.hypotheses import Hypothesis
+from jaxvm.discover.hypotheses import FREE, Hypothesis
 from jaxvm.discover.rivals import Rival
 from jaxvm.discover.select import price, price_of_columns
 from jaxvm.network.scene import Scene
-from jaxvm.physics.effects import room_for
+from jaxvm.physics.effects import Effect, room_for
 from jaxvm.solve.adjust import Adjustment
 from jaxvm.solve.covariance import wald_drops
 
@@ -37,16 +37,50 @@ _LIKELIER = 2.0
 def prune(
     current: Adjustment, findings: list[Finding], n: int, fit: Fit
 ) -> tuple[Adjustment, list[Finding]]:
-    """Drop an earlier finding that the later ones made superfluous (Wald test against BIC)."""
+    """Drop an earlier finding that the later ones made superfluous (Wald test against BIC).
+
+    Amounts of every image can follow whatever has a course, but must be larger for it: what the
+    course saves them counts for it.
+    """
     given = len(current.scene.effects) - len(findings)
     earlier = [k for k in _superfluous(current, findings, n) if k < len(findings) - 1]
     if earlier:
         k = earlier[0]
         effects = current.scene.fitted_effects()
         kept = (*effects[: given + k], *effects[given + k + 1 :])
-        findings = findings[:k] + findings[k + 1 :]
-        return fit(current.scene.with_effects(kept, current.scene.room)), findings
+        without = fit(current.scene.with_effects(kept, current.scene.room))
+        lost = lost_without(current, findings)[k] / current.variance_factor
+        if lost + _wider(given + k, current, without, n) < _price_of(findings[k], lost, n):
+            return without, findings[:k] + findings[k + 1 :]
     return current, findings
+
+
+def _wider(k: int, current: Adjustment, without: Adjustment, n: int) -> float:
+    """What amounts of every image cost more without the effect at place k, which they can follow.
+
+    The price of an amount goes with the logarithm of what all of them explain, that is of their
+    square; it is at most ln n.
+    """
+    effects, cost = current.scene.fitted_effects(), 0.0
+    others = (*effects[:k], *effects[k + 1 :])
+    for one, other in zip(others, without.scene.fitted_effects(), strict=True):
+        if follows(one, effects[k]):
+            old, new = (float(np.sum(np.square(e.amplitudes))) for e in (one, other))
+            used = int(np.count_nonzero(other.amplitudes))
+            cost += used * float(np.clip(np.log(new / max(old, 1e-300)), 0.0, np.log(n)))
+    return cost
+
+
+def follows(one: Effect, effect: Effect) -> bool:
+    """Whether one has an amount in every image with which it can take the course of an effect."""
+    ports = {term.port for term in one.terms if term.driver == "epoch"}
+    own = {term.port for term in effect.terms}
+    return len(one.amplitudes) > FREE and own <= ports and one.scope == effect.scope
+
+
+def followed(findings: list[Finding], k: int) -> bool:
+    """Whether another finding has amounts of every image that can take the course of the k-th."""
+    return any(f is not findings[k] and follows(f.effect, findings[k].effect) for f in findings)
 
 
 def rename(
@@ -55,11 +89,15 @@ def rename(
     """Give each finding the name that fits best beside all the others.
 
     What led when it was found is tried again in its place, and so is what outweighs it now. A name
-    that makes another finding superfluous wins by what that one cost.
+    that makes another finding superfluous wins by what that one cost. What amounts of every image
+    can follow fits under any name beside them, and keeps its own.
     """
     k, left = 0, _MOST_TRIED
     while len(findings) > 1 and k < len(findings):
         finding = findings[k]
+        if followed(findings, k):
+            k += 1
+            continue
         heavier = [r.hypothesis for r in finding.rivals if r.weight > finding.weight]
         others = [h for h in finding.alternatives if not h.same(finding.hypothesis)][:left]
         left -= len(others)
@@ -157,10 +195,15 @@ def _superfluous(current: Adjustment, findings: list[Finding], n: int) -> list[i
     lost = lost_without(current, findings)
     for k, (finding, rise) in enumerate(zip(findings, lost, strict=True)):
         drop = rise / current.variance_factor
-        price = price_of_columns(finding.hypothesis, finding.effect.amplitudes, drop, n)
-        if drop < price + len(finding.effect.constants) * np.log(n):
+        if drop < _price_of(finding, drop, n):
             found.append(k)
     return found
+
+
+def _price_of(finding: Finding, drop: float, n: int) -> float:
+    """What the amplitudes and constants of a finding cost, of which a drop is left."""
+    price = price_of_columns(finding.hypothesis, finding.effect.amplitudes, drop, n)
+    return price + len(finding.effect.constants) * float(np.log(n))
 
 
 def lost_without(current: Adjustment, findings: list[Finding]) -> list[float]:

@@ -20,7 +20,7 @@ from jaxvm.discover.space import member
 from jaxvm.physics.effects import Effect
 from jaxvm.solve.adjust import Adjustment
 
-MOST, PLACES = 8, 3
+MOST, PLACES = 12, 3
 """Names that are kept, and places of each."""
 
 _ODDS = 20.0

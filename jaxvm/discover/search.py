@@ -14,7 +14,7 @@ from jaxvm.discover.heldout import HeldOut, Split, gain
 from jaxvm.discover.noise import Correlation, Met, met, random_signs
 from jaxvm.discover.pairs import better_pair, other_beginnings, worth_a_second_thought
 from jaxvm.discover.ranking import Ranking, spread_of_constant, surprise
-from jaxvm.discover.revise import likelier, lost_without, prune, rename, with_effects
+from jaxvm.discover.revise import followed, likelier, lost_without, prune, rename, with_effects
 from jaxvm.discover.rivals import rivals
 from jaxvm.discover.scatter import ALIKE, likeness, of_each_image
 from jaxvm.discover.score import ScoreTests
@@ -372,8 +372,13 @@ class Search:
             self.current, self.findings = current, findings
 
     def _weighed_again(self, k: int) -> Finding:
-        """A finding among its rivals with all the others in the model, and with those it had."""
+        """A finding among its rivals with all the others in the model, and with those it had.
+
+        Beside amounts of every image that can follow it all names are alike: it keeps those it had.
+        """
         finding, scene, parts = self.findings[k], self.current.scene, self.parts
+        if followed(self.findings, k):
+            return finding
         effects = scene.fitted_effects()
         others = (*effects[: self.given + k], *effects[self.given + k + 1 :])
         without = parts.fit(scene.with_effects(others, scene.room))
