@@ -1,6 +1,6 @@
 """Accept a hypothesis: refit the leading ones; the best that improves held-out epochs wins."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -8,6 +8,7 @@ from jaxvm.discover.heldout import Gain, HeldOut, Split, gain
 from jaxvm.discover.hypotheses import FREE, Hypothesis
 from jaxvm.discover.select import Candidate, identity, refit
 from jaxvm.solve.adjust import Adjustment
+from jaxvm.solve.covariance import effect_deviations
 
 _CANDIDATES = 4
 _NEAR = 30.0
@@ -82,7 +83,8 @@ def accept(
             shown = split.evaluate(candidate.adjustment.scene)
             proof = gain(heldout, shown, seed)
             fixed = candidate.hypothesis.course.driver == "constant"
-            if proof.proven or (fixed and candidate.evidence > STRONG and proof.probability > 0.5):
+            hopeful = fixed and candidate.evidence > STRONG and proof.probability > 0.5
+            if (proof.proven or hopeful) and _is_determined(candidate, shown):
                 gap = max(_OPEN[0], _OPEN[1] * abs(candidate.evidence))
                 others = tuple(
                     c
@@ -92,6 +94,12 @@ def accept(
                 return Accepted(candidate, others, shown, proof, tuple(tried))
             hopeless.add((identity(candidate.hypothesis), candidate.hypothesis.course))
     return short(leading[0][0])
+
+
+def _is_determined(candidate: Candidate, shown: HeldOut) -> bool:
+    """Whether the fit, completed by the held-out epochs, has a size for what it added."""
+    completed = replace(candidate.adjustment, scene=shown.scene)
+    return bool(np.isfinite(effect_deviations(completed)[-1]).all())
 
 
 def _least(hypothesis: Hypothesis) -> float:

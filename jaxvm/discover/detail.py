@@ -62,7 +62,7 @@ def with_detail(
                 final_effect=effect,
                 stds=effect_deviations(tried)[-1],
                 weight=1.0,
-                drivers=(),
+                others=(),
                 rivals=(),
                 drop=sum(f.drop for f in members),
                 after=parts.residuals(tried),
