@@ -21,6 +21,7 @@ def check_recording(recording: Recording, table: Table) -> None:
     _unused(recording, table)
     _too_few(recording, table)
     _effects(recording)
+    _poses(recording)
 
 
 def _pixels(recording: Recording, table: Table) -> None:
@@ -127,3 +128,15 @@ def _effects(recording: Recording) -> None:
                 f'recording.toml: effect "{effect.name}" depends on "{effect.driver}", which is '
                 f"not recorded (there is: {', '.join(sorted(known))}); add it to the drivers"
             )
+
+
+def _poses(recording: Recording) -> None:
+    """Poses that are given in each epoch are as many as there are epochs."""
+    model, n = recording.model, len(recording.time)
+    for kind, bodies in (("stations", model.stations), ("targets", model.targets)):
+        for body in bodies:
+            if body.pose is not None and body.pose.ndim > 1 and len(body.pose) != n:
+                raise RecordingError(
+                    f"recording.toml: {kind}.{body.name}.pose has {len(body.pose)} rows, but there "
+                    f"are {n} epochs; give one row for each, or a single pose"
+                )

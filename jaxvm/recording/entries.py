@@ -147,22 +147,41 @@ class Entry:
                 )
         return frozenset(names)
 
-    def pose(self) -> np.ndarray | None:
-        """Turn (rad) and shift (m) in one vector."""
+    def pose(self, moves: bool = False) -> np.ndarray | None:
+        """Turn (rad) and shift (m) in one vector; what moves may have one such row an epoch."""
         if "pose" not in self:
             return None
         entry = self.entry("pose").only(("turn_rad", "shift_m"))
         for key in ("turn_rad", "shift_m"):
             entry.needs(key, "[0.0, 0.0, 0.0]")
-        turn, shift = entry.vector("turn_rad", 3), entry.vector("shift_m", 3)
-        assert turn is not None and shift is not None
-        if np.linalg.norm(turn) > 2.0 * math.pi:
+        turn, shift = (entry._triples(key, moves) for key in ("turn_rad", "shift_m"))
+        if turn.shape != shift.shape:
+            entry.fail(
+                "shift_m",
+                f"{entry.title('turn_rad')} has {np.size(turn) // 3} rows and "
+                f"{entry.title('shift_m')} {np.size(shift) // 3}; give both for every epoch",
+            )
+        length = float(np.max(np.linalg.norm(np.atleast_2d(turn), axis=1)))
+        if length > 2.0 * math.pi:
             entry.fail(
                 "turn_rad",
-                f"{entry.title('turn_rad')} has length {np.linalg.norm(turn):.4g}, more than 2 pi; "
+                f"{entry.title('turn_rad')} has length {length:.4g}, more than 2 pi; "
                 "a rotation vector in rad is needed, convert it if this is in degrees",
             )
-        return np.concatenate([turn, shift])
+        return np.concatenate([turn, shift], axis=-1)
+
+    def _triples(self, key: str, many: bool) -> np.ndarray:
+        """Three numbers, or a list of such rows where there may be many."""
+        value = self.table[key]
+        nested = many and isinstance(value, list) and value and isinstance(value[0], list)
+        wanted = "a list of 3 numbers" + (", or one such list for every epoch" if many else "")
+        found = []
+        for row in value if nested else [value]:
+            if not isinstance(row, list) or len(row) != 3:
+                given = f"{len(row)} entries" if isinstance(row, list) else repr(row)
+                self.fail(key, f"{self.title(key)} has {given}; it must be {wanted}")
+            found.append(self._numbers(key, row, wanted))
+        return np.array(found) if nested else found[0]
 
     def _numbers(self, key: str, values: list, wanted: str) -> np.ndarray:
         for value in values:

@@ -41,7 +41,12 @@ def join(first: Recording, second: Recording) -> Recording:
         for name in dict.fromkeys([*first.velocities, *second.velocities])
     }
     return Recording(
-        model=replace(model, cameras=cameras),
+        model=replace(
+            model,
+            cameras=cameras,
+            stations=_in_each_epoch(first, second, "stations"),
+            targets=_in_each_epoch(first, second, "targets"),
+        ),
         epoch_ids=np.concatenate(
             [first.epoch_ids, second.epoch_ids + first.epoch_ids.max() + 1 - second.epoch_ids.min()]
         ),
@@ -69,6 +74,20 @@ def _common(first: Model, second: Model) -> Model:
         if a.point_names != b.point_names:
             raise ValueError(f'target "{a.name}" has other marks in the second recording')
     return first
+
+
+def _in_each_epoch(first: Recording, second: Recording, kind: str) -> tuple:
+    """Bodies of the first recording, with the poses of both where they are given in each epoch."""
+    bodies = []
+    for a, b in zip(getattr(first.model, kind), getattr(second.model, kind), strict=True):
+        if a.pose is not None and b.pose is not None and max(a.pose.ndim, b.pose.ndim) > 1:
+            own, other = (
+                np.broadcast_to(body.pose, (len(recording.time), 6))
+                for body, recording in ((a, first), (b, second))
+            )
+            a = replace(a, pose=np.concatenate([own, other]))
+        bodies.append(a)
+    return tuple(bodies)
 
 
 def _velocity(recording: Recording, name: str) -> np.ndarray:

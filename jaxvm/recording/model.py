@@ -4,11 +4,11 @@ All defaults of recording.toml are resolved here: a body that is held has a pose
 everything that the adjustment estimates.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxvm.geometry.lenses import LENS_NAMES, lens_family
 from jaxvm.geometry.targets import grid_points
@@ -23,6 +23,9 @@ Motion = Literal["static", "per-epoch"]
 
 Pose = Float[np.ndarray, "6"]
 """Turn (rotation vector, rad), then shift (m): X_outer = exp(turn) @ X_inner + shift."""
+
+Poses = Float[np.ndarray, "*epochs 6"]
+"""A pose, or one in each epoch of what moves."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +59,7 @@ class Station:
 
     name: str
     motion: Motion = "static"
-    pose: Pose | None = None
+    pose: Poses | None = None
     free: frozenset[str] = frozenset()
 
 
@@ -76,7 +79,7 @@ class Target:
     point_names: tuple[str, ...]
     points: Float[np.ndarray, "n 3"]
     motion: Motion = "static"
-    pose: Pose | None = None
+    pose: Poses | None = None
     free: frozenset[str] = frozenset()
     station: str = ""
 
@@ -133,6 +136,20 @@ class Model:
     priors: tuple[Prior, ...] = ()
     closures: tuple[Closure, ...] = ()
     effects: tuple[Effect, ...] = ()
+
+
+def of_epochs(model: Model, mask: Bool[np.ndarray, " epochs"]) -> Model:
+    """The model of some epochs: bodies whose poses are given in each epoch keep those of them."""
+
+    def kept(body):
+        pose = body.pose
+        return body if pose is None or pose.ndim == 1 else replace(body, pose=pose[mask])
+
+    return replace(
+        model,
+        stations=tuple(kept(station) for station in model.stations),
+        targets=tuple(kept(target) for target in model.targets),
+    )
 
 
 def grid_names(rows: int, columns: int) -> tuple[str, ...]:
@@ -208,10 +225,10 @@ def camera_table(camera: Camera) -> dict[str, Any]:
     return {**table, **_held(camera.pose, camera.free)}
 
 
-def _held(pose: Pose | None, free: frozenset[str]) -> dict[str, Any]:
+def _held(pose: Poses | None, free: frozenset[str]) -> dict[str, Any]:
     table: dict[str, Any] = {"free": sorted(free)}
     if pose is not None:
-        table["pose"] = {"turn_rad": _floats(pose[:3]), "shift_m": _floats(pose[3:])}
+        table["pose"] = {"turn_rad": pose[..., :3].tolist(), "shift_m": pose[..., 3:].tolist()}
     return table
 
 

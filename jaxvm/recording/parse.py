@@ -197,12 +197,13 @@ def _stations(root: Entry, used: list[str]) -> tuple[Station, ...]:
             stations.append(Station(name, "static", np.zeros(6), frozenset()))
             continue
         entry = entries[name].only(("motion", "pose", "free"))
-        pose, free = entry.pose(), entry.free(("pose",))
+        motion = _motion(entry, "static")
+        pose, free = entry.pose(motion == "per-epoch"), entry.free(("pose",))
         if free is None:
             free = frozenset(() if pose is not None or len(names) == 1 else ("pose",))
         if pose is None and not free:
             pose = np.zeros(6)
-        stations.append(Station(name, _motion(entry, "static"), pose, free))
+        stations.append(Station(name, motion, pose, free))
     return tuple(stations)
 
 
@@ -231,15 +232,15 @@ def _motion(entry: Entry, default: str | None = None) -> Motion:
 def _target(name: str, entry: Entry) -> Target:
     entry.only(("grid", "points", "station", "motion", "pose", "free"))
     names, points = _marks(entry)
-    pose, free = entry.pose(), entry.free(("pose", "points"))
+    station = entry.string("station", "")
+    motion = _motion(entry, "static" if station else None)
+    pose, free = entry.pose(motion == "per-epoch"), entry.free(("pose", "points"))
     if free is None:
         free = frozenset(("pose",) if pose is None else ())
     if not np.isfinite(points).all():
         free |= {"points"}
     if pose is None and "pose" not in free:
         pose = np.zeros(6)
-    station = entry.string("station", "")
-    motion = _motion(entry, "static" if station else None)
     return Target(name, names, points, motion, pose, free, station)
 
 

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxvm.physics.drivers import build_channels
 from jaxvm.physics.effects import Channels
-from jaxvm.recording.model import Model
+from jaxvm.recording.model import Model, of_epochs
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +141,7 @@ class Recording:
         if not mask.any():
             raise ValueError("the mask selects no epoch; set at least one entry")
         row = np.where(mask, np.cumsum(mask) - 1, -1)
-        links, model = self.links, self.model
+        links, model = self.links, of_epochs(self.model, mask)
         if links is not None:
             kept = (links.epoch < 0) | mask[np.maximum(links.epoch, 0)]
             lost = {name for name, keep in zip(links.name, kept, strict=True) if not keep}
