@@ -1,0 +1,93 @@
+"""Earlier findings beside amounts of every image that could follow them."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from networks import board_recording
+
+from jaxvm.discover.courses import Course
+from jaxvm.discover.groups import Group
+from jaxvm.discover.hypotheses import Hypothesis
+from jaxvm.discover.revise import followed, follows, prune
+from jaxvm.network.residual import predict_pixels
+from jaxvm.physics.catalogue.entry import each
+from jaxvm.physics.effects import Effect, Scope, Term
+from jaxvm.solve.adjust import adjust
+
+N_EPOCHS = 24
+CAMERA = Scope(camera=("cam",))
+AMOUNTS = each("epoch", "sensor.focal", numbers=range(N_EPOCHS))
+
+
+@dataclass(frozen=True)
+class Told:
+    """Of a finding, what `prune` needs."""
+
+    hypothesis: Hypothesis
+    effect: Effect
+    drop: float = 1e3
+
+
+def told(effect):
+    course = Course(effect.driver, effect.form, effect.constants)
+    group = Group(effect.terms, "camera")
+    return Told(Hypothesis(group, course, effect.scope, ()), effect)
+
+
+def refitted(scene, weights):
+    return adjust(scene, weights=weights, check=False)
+
+
+@pytest.fixture(scope="module")
+def known():
+    return board_recording(n_epochs=N_EPOCHS, free=frozenset())
+
+
+def pruned(known, jump, hunting, seed=3):
+    """Names that are left of a jump of the focal length and of amounts of every image."""
+    (board,) = known.recording.model.targets
+    held = replace(board, pose=known.truth["carrier_from_target"], free=frozenset())
+    recording = known.with_model(targets=(held,))
+    instant = float(np.mean(recording.time[11:13]))
+    rng = np.random.default_rng(seed)
+    step = Effect("jump", (Term("sensor.focal"),), "time", "step", (instant,), 0.0, CAMERA, (jump,))
+    every = tuple(hunting * rng.standard_normal(N_EPOCHS))
+    hunts = Effect("hunts", AMOUNTS, scope=CAMERA, amplitudes=every, spread=3e-3)
+    room = (N_EPOCHS + 8, 4)
+    truth = known.true_scene(recording).with_effects((step, hunts), room)
+    obs = recording.observations
+    pixel = np.zeros(obs.pixel.shape)
+    for rows, own in zip(truth.tables, predict_pixels(truth.state, truth.network), strict=True):
+        pixel[rows] = np.asarray(own)[: len(rows)]
+    pixel += obs.sigma[:, None] * rng.standard_normal(pixel.shape)
+    drawn = replace(recording, observations=replace(obs, pixel=pixel))
+    scene = known.true_scene(drawn).with_effects((step, hunts), room)
+    weights = tuple(np.ones(len(rows)) for rows in scene.tables)
+    current = refitted(scene, weights)
+    findings = [told(effect) for effect in current.scene.fitted_effects()]
+    fit = lambda scene: refitted(scene, weights)  # noqa: E731
+    left, kept = prune(current, findings, obs.pixel.size, fit)
+    assert [f.effect.name for f in kept] == [e.name for e in left.scene.fitted_effects()]
+    return [f.effect.name for f in kept]
+
+
+def test_a_course_stays_beside_amounts_that_could_follow_it(known):
+    assert pruned(known, jump=4e-3, hunting=2e-4) == ["jump", "hunts"]
+
+
+def test_a_course_that_saves_the_amounts_nothing_goes(known):
+    for seed in range(4):
+        assert pruned(known, jump=0.0, hunting=2e-3, seed=seed) == ["hunts"]
+
+
+def test_amounts_follow_what_acts_at_their_ports_and_place():
+    hunts = Effect("hunts", AMOUNTS, scope=CAMERA, amplitudes=(0.0,) * N_EPOCHS)
+    step = Effect("jump", (Term("sensor.focal"),), "time", "step", (1.0,), 0.0, CAMERA, (0.0,))
+    elsewhere = replace(step, scope=Scope(camera=("other",)))
+    shift = replace(step, terms=(Term("sensor.cx"),))
+    assert follows(hunts, step)
+    assert not any(follows(hunts, other) for other in (elsewhere, shift))
+    assert not follows(step, hunts)
+    findings = [told(step), told(hunts), told(shift)]
+    assert [followed(findings, k) for k in range(3)] == [True, False, False]
