@@ -35,6 +35,9 @@ _WORSE = 1.01
 _WIDER = 1.2
 """Inflation by noise from which the rivals of a finding are weighed again: more of them stay."""
 
+_TURNS = 3
+"""Findings that in turn only took the place of another, until they are as good as each other."""
+
 FLIPS = 199
 """Repetitions of the null distribution."""
 
@@ -96,7 +99,7 @@ class Search:
 
     def _search(self, most: int, progress: Callable[[str], None]) -> Ranking:
         """Take one effect after the other; returns the first scores."""
-        first = None
+        first, turns = None, 0
         for _ in range(3 * most + 1):
             progress(f"scoring hypotheses (round {len(self.findings) + 1})")
             leading = [
@@ -105,7 +108,7 @@ class Search:
                 if not any(item[0].covered(f.hypothesis) for f in self.findings)
             ]
             first = first or self.ranking
-            if len(self.findings) == most:
+            if len(self.findings) == most or turns == _TURNS:
                 break
             leading, self._finer = at_finer_constants(
                 leading, self._tests, self.ranking, self.parts.n
@@ -121,9 +124,10 @@ class Search:
                     self.p_value = min(scored, self.p_value)
                     break
             self.unproven = ""
-            effect = accepted.chosen.effect
+            effect, before = accepted.chosen.effect, len(self.findings)
             self._take(accepted, leading)
             progress(f"found: {effect.name} ({effect.scope.words()})")
+            turns = turns + 1 if len(self.findings) <= before else 0
             if len(self.findings) > 1 and min(f.p_value for f in self.findings[-2:]) > self.alpha:
                 break
         return first or self.ranking
