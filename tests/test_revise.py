@@ -44,8 +44,8 @@ def known():
     return board_recording(n_epochs=N_EPOCHS, free=frozenset())
 
 
-def pruned(known, jump, hunting, seed=3):
-    """Names that are left of a jump of the focal length and of amounts of every image."""
+def pruned(known, jump, hunting, seed=3, idle=()):
+    """Names that are left of a jump of the focal length, idle effects, and amounts of every image."""
     (board,) = known.recording.model.targets
     held = replace(board, pose=known.truth["carrier_from_target"], free=frozenset())
     recording = known.with_model(targets=(held,))
@@ -55,14 +55,14 @@ def pruned(known, jump, hunting, seed=3):
     every = tuple(hunting * rng.standard_normal(N_EPOCHS))
     hunts = Effect("hunts", AMOUNTS, scope=CAMERA, amplitudes=every, spread=3e-3)
     room = (N_EPOCHS + 8, 4)
-    truth = known.true_scene(recording).with_effects((step, hunts), room)
+    truth = known.true_scene(recording).with_effects((step, *idle, hunts), room)
     obs = recording.observations
     pixel = np.zeros(obs.pixel.shape)
     for rows, own in zip(truth.tables, predict_pixels(truth.state, truth.network), strict=True):
         pixel[rows] = np.asarray(own)[: len(rows)]
     pixel += obs.sigma[:, None] * rng.standard_normal(pixel.shape)
     drawn = replace(recording, observations=replace(obs, pixel=pixel))
-    scene = known.true_scene(drawn).with_effects((step, hunts), room)
+    scene = known.true_scene(drawn).with_effects((step, *idle, hunts), room)
     weights = tuple(np.ones(len(rows)) for rows in scene.tables)
     current = refitted(scene, weights)
     findings = [told(effect) for effect in current.scene.fitted_effects()]
@@ -74,6 +74,11 @@ def pruned(known, jump, hunting, seed=3):
 
 def test_a_course_stays_beside_amounts_that_could_follow_it(known):
     assert pruned(known, jump=4e-3, hunting=2e-4) == ["jump", "hunts"]
+
+
+def test_what_comes_after_a_course_that_stays_goes_all_the_same(known):
+    idle = Effect("idle", (Term("sensor.cx"),), "time", "linear", (), 0.0, CAMERA, (0.0,))
+    assert pruned(known, jump=4e-3, hunting=2e-4, idle=(idle,)) == ["jump", "hunts"]
 
 
 def test_a_course_that_saves_the_amounts_nothing_goes(known):

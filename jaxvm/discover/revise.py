@@ -43,14 +43,15 @@ def prune(
     course saves them counts for it.
     """
     given = len(current.scene.effects) - len(findings)
-    earlier = [k for k in _superfluous(current, findings, n) if k < len(findings) - 1]
-    if earlier:
-        k = earlier[0]
-        effects = current.scene.fitted_effects()
+    effects, lost = current.scene.fitted_effects(), lost_without(current, findings)
+    for k, finding in enumerate(findings[:-1]):
+        drop = lost[k] / current.variance_factor
+        price = _price_of(finding, drop, n)
+        if drop >= price:
+            continue
         kept = (*effects[: given + k], *effects[given + k + 1 :])
         without = fit(current.scene.with_effects(kept, current.scene.room))
-        lost = lost_without(current, findings)[k] / current.variance_factor
-        if lost + _wider(given + k, current, without, n) < _price_of(findings[k], lost, n):
+        if drop + _wider(given + k, current, without, n) < price:
             return without, findings[:k] + findings[k + 1 :]
     return current, findings
 
