@@ -45,7 +45,7 @@ def known():
 
 
 def pruned(known, jump, hunting, seed=3, idle=()):
-    """Names that are left of a jump of the focal length, idle effects, and amounts of every image."""
+    """Names left of a jump of the focal length, idle effects, and amounts of every image."""
     (board,) = known.recording.model.targets
     held = replace(board, pose=known.truth["carrier_from_target"], free=frozenset())
     recording = known.with_model(targets=(held,))
@@ -53,7 +53,7 @@ def pruned(known, jump, hunting, seed=3, idle=()):
     rng = np.random.default_rng(seed)
     step = Effect("jump", (Term("sensor.focal"),), "time", "step", (instant,), 0.0, CAMERA, (jump,))
     every = tuple(hunting * rng.standard_normal(N_EPOCHS))
-    hunts = Effect("hunts", AMOUNTS, scope=CAMERA, amplitudes=every, spread=3e-3)
+    hunts = Effect("hunts", AMOUNTS, scope=CAMERA, amplitudes=every, spread=6e-3)
     room = (N_EPOCHS + 8, 4)
     truth = known.true_scene(recording).with_effects((step, *idle, hunts), room)
     obs = recording.observations
