@@ -12,6 +12,7 @@ from jaxvm.discover.hypotheses import Hypothesis
 from jaxvm.discover.instants import at_best_instants, instants_of, with_spread
 from jaxvm.network.residual import predict_pixels
 from jaxvm.physics.effects import Effect, Scope, Term
+from jaxvm.report.words import when
 from jaxvm.solve.adjust import adjust
 from jaxvm.solve.covariance import effect_deviations
 
@@ -135,3 +136,12 @@ def test_what_has_no_instant_is_left_alone(board):
     final, weights, found = fitted(board, steady, steady)
     assert instants_of(final, 0, found, weights) is None
     assert with_spread(found, None) is found
+
+
+def test_words_tell_how_sure_an_instant_is():
+    step = slipped(894.0, 1e-3)
+    assert "instant 14.9 min" in when(step)
+    assert "instant 14.9 ± 1.0 min" in when(step, (1e-5, 1e-5, 61.0))
+    settling = slipped(894.0, 1e-3, "settling", 300.0)
+    assert "instant" not in when(settling, (1e-5, 1e-5, 61.0))
+    assert "start 14.9 ± 1.0 min, time constant 5 min" in when(settling, (1e-5, 1e-5, 61.0))

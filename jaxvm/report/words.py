@@ -125,16 +125,20 @@ def _significant(value: float, digits: int) -> str:
     return f"{float(text):g}" if re.search(r"e[+-]?\d", text) and 1e-4 < abs(value) < 1e6 else text
 
 
-def when(effect: Effect) -> str:
-    """How an effect runs: "always", or with its driver and the constants of its form."""
+def when(effect: Effect, stds: tuple[float, ...] = ()) -> str:
+    """How an effect runs: "always", or with its driver and the constants of its form.
+
+    Of these the standard deviations, where `stds` of all its parameters are given.
+    """
     form = FORMS[effect.form]
     if effect.form == "constant":
         return "always"
     words = form.words.format(driver=effect.driver)
     unit = driver_unit(effect.driver)
+    known = (*stds[effect.n_columns :], *(0.0 for _ in effect.constants))[: len(effect.constants)]
     named = [
-        f"{constant.name} {quantity(value, 0.0, constant.unit.replace('driver', unit))}"
-        for constant, value in zip(form.constants, effect.constants, strict=True)
+        f"{constant.name} {quantity(value, std, constant.unit.replace('driver', unit))}"
+        for constant, value, std in zip(form.constants, effect.constants, known, strict=True)
     ]
     return f"{words} ({', '.join(named)})" if named else words
 
@@ -333,7 +337,8 @@ def summary(diagnosis: Diagnosis) -> str:
             "",
             f"{number}. {effect.name}{named}",
             f"   where     {effect.scope.words()}",
-            f"   when      {when(effect)}" + (f": it {shape}" if shape else ""),
+            f"   when      {when(finding.final_effect, finding.final_stds)}"
+            + (f": it {shape}" if shape else ""),
             f"   size      {size(finding)}",
             f"   explains  {100 * finding.share:.0f} % of the excess chi-square, "
             f"{in_pixels(finding):.3f} px RMS; p = {finding.p_value:.2g}, family-wise, "
