@@ -50,6 +50,7 @@ OBSERVATION_DRIVERS: dict[str, str] = {
     "target_up_x": "1",
     "target_up_y": "1",
     "target_up_z": "1",
+    "radius2_over_range": "half diagonal²/m",
 }
 """Observation-like drivers and their units."""
 
@@ -146,6 +147,7 @@ def observation_drivers(
 
     half_diagonal = 0.5 * jnp.linalg.norm(image_size)
     from_centre = (predicted - sight.centre) / half_diagonal
+    radius = jnp.linalg.norm(from_centre)
     in_image = (predicted + 0.5) / image_size - 0.5
     in_target = (sight.point - at.target_centre)[:2] / at.target_half_size
     return jnp.stack(
@@ -153,7 +155,7 @@ def observation_drivers(
             jnp.ones(()),
             in_image[1],
             in_image[0],
-            jnp.linalg.norm(from_centre),
+            radius,
             from_centre[0],
             from_centre[1],
             predicted[0],
@@ -175,6 +177,7 @@ def observation_drivers(
             up_target[0],
             up_target[1],
             up_target[2],
+            radius**2 / distance,
         ]
     )
 

@@ -13,7 +13,10 @@ from jaxvm.physics.catalogue.entry import (
 )
 from jaxvm.physics.effects import Term
 
-_FOCAL, _RADIAL = (plain("sensor.focal"),), (plain("lens.k1"),)
+_FOCAL = (plain("sensor.focal"),)
+_RADIAL = (plain("lens.k1"), (Term("sensor.focal", "radius", "square"),))
+"""By the tangent of the field angle, and in the image: towards 90 degrees these are not alike."""
+
 _DECENTRING = pair("lens.p1", "lens.p2")
 _INTRINSICS = plain("sensor.focal", "sensor.cx", "sensor.cy")
 _DOME = (
@@ -175,6 +178,7 @@ LENS: tuple[Entry, ...] = (
         "distortion-with-range", "the distortion depends on the range", (44,),
         (
             (Term("lens.k1", "inverse_range", "linear"),),
+            (Term("sensor.focal", "radius2_over_range", "linear"),),
             # Over the slanted range, unlike over the depth, a scale is a distortion, too.
             (Term("sensor.focal", "inverse_range", "linear"),),
         ), ALWAYS, ALWAYS, "camera",
