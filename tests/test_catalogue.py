@@ -7,13 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from networks import matrix, stereo_recording, to_plane, to_point
+from networks import board_recording, matrix, stereo_recording, to_plane, to_point
+from scipy.spatial.transform import Rotation
 
 from jaxvm.discover.courses import driver_kind, kinds_in_scope
 from jaxvm.discover.hypotheses import Hypothesis
 from jaxvm.discover.scatter import families_of_images
 from jaxvm.discover.space import enumerate_hypotheses, member
-from jaxvm.network.binding import in_scope, range_driver_table
+from jaxvm.network.binding import in_scope, observation_driver_table, range_driver_table
 from jaxvm.network.residual import residual
 from jaxvm.network.scene import Scene, build
 from jaxvm.network.tables import along_beam
@@ -136,6 +137,16 @@ def test_kind_of_a_channel(name, kind):
 
 def names(terms, entity, form, *kinds):
     return [entry.id for entry in entries_for(terms, entity, kinds, form)]
+
+
+def test_distortion_changes_in_the_image_too():
+    """Towards 90 degrees from the axis a polynomial of the tangent is none of the image."""
+    in_image = partial(names, (Term("sensor.focal", "radius", "square"),), "camera")
+    assert in_image("linear", "temperature") == ["distortion-drift", "defocus-drift"]
+    assert in_image("step", "time") == ["distortion-jump"]
+    assert in_image("onset", "power-on") == ["distortion-warm-up"]
+    near = (Term("sensor.focal", "radius2_over_range", "linear"),)
+    assert names(near, "camera", "constant", "constant") == ["distortion-with-range"]
 
 
 def test_the_kind_of_a_channel_decides_the_name():
@@ -277,6 +288,23 @@ def test_what_a_recording_lacks_is_not_asked():
     assert ports(with_finder) - ports(without) == {"range.offset", "range.scale"}
     for family in (*with_finder, *without):
         assert family.valid.any(axis=(1, 2)).all() and len(family.groups) == len(family.valid)
+
+
+def test_distortion_by_range_by_hand():
+    """The square of the radius in the image over the slanted distance of the mark."""
+    known = board_recording(noise=0.0, n_epochs=2)
+    scene, obs = known.true_scene(), known.recording.observations
+    rows = scene.tables[0]
+    table = np.asarray(observation_driver_table(scene, scene.network.pixels[0], rows))[: len(rows)]
+    pose = known.truth["carrier_from_target"][obs.epoch[rows]]
+    marks = known.recording.model.targets[0].points[obs.point[rows]]
+    distance = np.linalg.norm(Rotation.from_rotvec(pose[:, :3]).apply(marks) + pose[:, 3:], axis=1)
+    from_centre = obs.pixel[rows] - known.truth["centre"][0]
+    (camera,) = known.recording.model.cameras
+    half = 0.5 * np.linalg.norm(camera.image_size)
+    expected = np.sum((from_centre / half) ** 2, axis=1) / distance
+    found = table[:, OBSERVATION_DRIVER_INDEX["radius2_over_range"]]
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
 # --- patterns over distances ----------------------------------------------------------------------
