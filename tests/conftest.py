@@ -2,7 +2,7 @@
 
 import pytest
 
-from jaxvm.solve.compiling import forget_compiled_if_many
+from jaxvm.compiling import forget_compiled_if_many
 
 
 @pytest.fixture(autouse=True, scope="module")

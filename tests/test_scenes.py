@@ -14,8 +14,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.stats import chi2
 
+import jaxvm.compiling
 import jaxvm.scenes.describe
-import jaxvm.solve.compiling
 from jaxvm.cli import main
 from jaxvm.network.residual import residual
 from jaxvm.network.scene import build

@@ -11,8 +11,8 @@ import pytest
 from networks import nudged, scale_recording
 from scipy.optimize import lsq_linear
 
+from jaxvm.compiling import compile_seconds
 from jaxvm.solve.adjust import adjust
-from jaxvm.solve.compiling import compile_seconds
 from jaxvm.solve.lbfgs import minimise_lbfgs
 from jaxvm.solve.spgd import SPGD, ConstantGain, SpallGain, TraceGain, minimise_spgd
 

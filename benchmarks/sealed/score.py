@@ -48,10 +48,10 @@ def fingerprint() -> str:
 
 def show(folder: Path, entry: dict) -> dict:
     """What a recording can show, as plain numbers. Runs in a worker."""
+    from jaxvm.solve.compiling import forget_compiled_if_many
     from power import shown
 
     from jaxvm.recording import read_recording
-    from jaxvm.solve.compiling import forget_compiled_if_many
 
     forget_compiled_if_many()
     recording = read_recording(folder / "recordings" / entry["id"])

@@ -19,12 +19,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxvm.solve.compiling import compile_seconds
 from layouts import Layout, reckoned
 
 from jaxvm.network.cycles import fundamental_cycles
 from jaxvm.network.scene import build
 from jaxvm.solve import condition
-from jaxvm.solve.compiling import compile_seconds
 from jaxvm.solve.large import minimise_large, scaled_large
 from jaxvm.solve.lbfgs import minimise_lbfgs
 from jaxvm.solve.problem import Problem, scene_problem

@@ -26,6 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.special import ndtr
 
+from jaxvm.compiling import program
 from jaxvm.discover.hypotheses import Hypothesis
 from jaxvm.discover.plans import PLANS, Plan, planned, possible
 from jaxvm.discover.rivals import Rival
@@ -278,7 +279,7 @@ def _information(scene: Scene, weights: tuple[np.ndarray, ...]) -> np.ndarray:
     return np.asarray(_reduced(normal_at(problem, jnp.zeros(problem.n)).hessian))
 
 
-@eqx.filter_jit
+@program
 def _reduced(hessian: Arrow):
     diagonal = hessian.diagonal()
     scale = jnp.where(diagonal > 0.0, 1.0 / jnp.sqrt(jnp.where(diagonal > 0.0, diagonal, 1.0)), 1.0)

@@ -6,10 +6,10 @@ any effect and its scope are constant.
 
 from dataclasses import dataclass
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxvm.compiling import program
 from jaxvm.network.binding import observation_driver_table, range_driver_table
 from jaxvm.network.factors import PixelFactor, RangeFactor
 from jaxvm.solve.adjust import Adjustment
@@ -102,7 +102,7 @@ def _whitened(problem: Problem, x):
     return [(half, t.value, t.tangent) for half, t in zip(halves, acting, strict=True)]
 
 
-@eqx.filter_jit
+@program
 def _half_rows(hessian: Arrow, packets, jacobians, sizes):
     factors = factorise(hessian)
     return [half_rows(factors, p, j, sizes) for p, j in zip(packets, jacobians, strict=True)]

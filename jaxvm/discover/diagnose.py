@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from jaxvm.compiling import forget_compiled_if_many
 from jaxvm.discover.advice import advise
 from jaxvm.discover.collocation import collocate
 from jaxvm.discover.constants import run_away
@@ -36,7 +37,6 @@ from jaxvm.network.start import start
 from jaxvm.physics.effects import Effect, capacity
 from jaxvm.recording import Recording
 from jaxvm.solve.adjust import Adjustment, adjust, reference_sigma
-from jaxvm.solve.compiling import forget_compiled_if_many
 from jaxvm.solve.covariance import effect_deviations
 from jaxvm.solve.snooping import robust_variance
 

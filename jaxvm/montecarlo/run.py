@@ -17,12 +17,12 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh
 from jaxtyping import Bool, Int, PRNGKeyArray
 
+from jaxvm.compiling import compile_seconds
 from jaxvm.montecarlo.pace import Pace
 from jaxvm.montecarlo.results import Results
 from jaxvm.montecarlo.statistics import Statistics
 from jaxvm.montecarlo.store import Store, versions
 from jaxvm.montecarlo.trials import AXIS, Study, Traced, Trial
-from jaxvm.solve.compiling import compile_seconds
 
 _FLUSH_SECONDS, _FLUSH_SHARE = 1.0, 0.02
 """Trials are written after a second, later on after a fiftieth of the time that has gone by: so

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from jaxvm.compiling import program
 from jaxvm.network.factors import PixelFactor, PriorFactor, RangeFactor
 from jaxvm.network.residual import Network, parts_of
 from jaxvm.network.tables import Tables
@@ -105,7 +106,7 @@ def observation_driver_table(scene: Scene, factor: PixelFactor, rows: np.ndarray
     return by_blocks(_driver_table, (factor, size), roomy(scene.state.flatten()), up)
 
 
-@eqx.filter_jit
+@program
 def _driver_table(table: tuple[PixelFactor, Array], flat, up):
     factor, size = table
     own = parts_of(factor, flat)
@@ -119,7 +120,7 @@ def range_driver_table(scene: Scene, factor: RangeFactor):
     return by_blocks(_range_driver_table, factor, roomy(scene.state.flatten()))
 
 
-@eqx.filter_jit
+@program
 def _range_driver_table(factor: RangeFactor, flat):
     own = parts_of(factor, flat)
     return all_range_drivers(Aim(*own), factor.circumstances, factor.to_plane)

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxvm.compiling import program
 from jaxvm.geometry.poses import Pose, TurnedPose
 from jaxvm.geometry.rotations import so3_exp, so3_left_jacobian
 from jaxvm.network.componentwise import Numbers, componentwise, joined
@@ -131,7 +132,7 @@ def present(network: Network, flat: Float[Array, " n"]) -> Present:
     )
 
 
-@jax.jit
+@program
 def _rotations(turns):
     return jax.vmap(so3_exp)(turns), jax.vmap(so3_left_jacobian)(turns)
 
@@ -275,7 +276,7 @@ def _by_numbers(function, factor: Factor, shared, ports) -> Any:
     return componentwise(function, _own(factor, shared), ports, data, axes=2)
 
 
-@eqx.filter_jit
+@program
 def _values(factor: Factor, shared, ports, dear: bool) -> Float[Array, "observations components"]:
     def local(own, ports, data):
         return factor.local(list(map(_still, own)), data, PortValues(ports, dear))
@@ -294,7 +295,7 @@ def _ports(
     return by_blocks(_port_values, (factor.view, factor.pattern), acting, only=only)
 
 
-@jax.jit
+@program
 def _port_values(table, acting: Acting):
     view, pattern = table
     return (acting.amplitude * acting.value.T[view] * pattern) @ acting.ports
@@ -366,7 +367,7 @@ def _owners(effects: EffectTable, n: int) -> Float[Array, "columns 2 constants"]
     return (index[:, :, None] == np.arange(n)).astype(float)
 
 
-@jax.jit
+@program
 def _by_effects(table, acting: Acting, slopes, owner):
     """Derivatives of rows by all amplitudes, then by all constants of effects."""
     by_ports, view, pattern = table
@@ -381,7 +382,7 @@ def _by_effects(table, acting: Acting, slopes, owner):
     return jnp.concatenate([by_amplitudes, by_constants], axis=2)
 
 
-@eqx.filter_jit
+@program
 def _derivatives(factor: Factor, shared, ports, live: tuple[int, ...], dear: bool):
     """Values of the rows, and their derivatives by live slots of their own and by all ports."""
     if not live and ports is None:

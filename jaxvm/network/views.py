@@ -7,11 +7,11 @@ OpenCV's closed-form solutions; they are start values and nothing more.
 from dataclasses import dataclass
 
 import cv2
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxvm.compiling import program
 from jaxvm.geometry.lenses import BrownConrady, LensFamily, lens_family
 from jaxvm.physics.blocks import rounded
 from jaxvm.recording import Recording
@@ -71,7 +71,7 @@ def rays_of_pixels(
     return rays / rays[:, 2:]
 
 
-@eqx.filter_jit
+@program
 def _undistort(family, image_points, coefficients):
     return jax.vmap(lambda p, c: family.undistort(c, p))(image_points, coefficients)
 

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxvm.compiling import program
 from jaxvm.geometry.poses import pose_from_vector
 from jaxvm.physics.blocks import by_blocks, hosted, roomy
 from jaxvm.physics.chain import Aim, Circumstances, Sight, predict_range
@@ -242,13 +243,13 @@ def patterns(
     return where(known[:, None], values, 0.0)
 
 
-@partial(jax.jit, static_argnames="name")
+@program
 def _bases(x, constants, name: str):
     x = jnp.where(jnp.isfinite(x), x, 0.0)
     return jax.vmap(lambda own: BASES[name](x, x, own), out_axes=1)(constants)
 
 
-@partial(jax.jit, static_argnames="name")
+@program
 def _waves(x, constants, name: str):
     ones = jnp.ones(2)
     return jax.vmap(lambda own: BASES[name](x @ own, x[:, 0], ones), out_axes=1)(constants)

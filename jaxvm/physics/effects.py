@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxvm.compiling import program
 from jaxvm.physics.blocks import by_blocks, continued, hosted, roomy, whole
 from jaxvm.physics.forms import BASIS_INDEX, EVERY_KIND, FORMS, Form, evaluate_basis, kinds_of
 from jaxvm.physics.ports import N_PORTS, PORT_INDEX
@@ -320,13 +321,13 @@ def _by_kinds(function, rows, channels: Channels) -> Any:
     return np.concatenate(found)[order, :n]
 
 
-@partial(jax.jit, static_argnames="kinds")
+@program
 def _at_epochs(rows, time, epoch_time, kinds=EVERY_KIND):
     on_grid = jax.vmap(lambda b, x, c: evaluate_basis(b, x, time, c, kinds))(*rows)
     return jax.vmap(lambda y: jnp.interp(epoch_time, time, y))(on_grid)
 
 
-@partial(jax.jit, static_argnames="kinds")
+@program
 def _slopes(rows, time, epoch_time, kinds=EVERY_KIND):
     # One shift for all columns: a column depends on no constant but its own two.
     basis, x, constants = rows

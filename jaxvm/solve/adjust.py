@@ -10,9 +10,9 @@ import numpy as np
 import optimistix as optx
 from jax.sharding import Mesh
 
+from jaxvm.compiling import compile_seconds, program
 from jaxvm.network.residual import Residuals, residual
 from jaxvm.network.scene import Scene
-from jaxvm.solve.compiling import compile_seconds
 from jaxvm.solve.descent import Descent
 from jaxvm.solve.gauge import check_gauge
 from jaxvm.solve.large import check_large_gauge, minimise_large, prepared
@@ -360,7 +360,7 @@ def degrees_of_freedom(problem: Problem, diagonal) -> int:
     return used - int(np.sum(np.asarray(diagonal) > 0))
 
 
-@eqx.filter_jit
+@program
 def _state(problem: Problem, x):
     return problem.state(x)
 

@@ -7,12 +7,12 @@ trusts the residuals.
 
 from collections.abc import Callable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxvm.compiling import program
 from jaxvm.network.residual import Residuals
 from jaxvm.network.state import State
 from jaxvm.solve.adjust import Adjustment
@@ -56,7 +56,7 @@ def _factors(adjustment: Adjustment) -> ArrowFactors | SparseFactors:
     return _factorised(normal_at(adjustment.problem, adjustment.x).hessian)
 
 
-_factorised = eqx.filter_jit(factorise)
+_factorised = program(factorise)
 
 
 def _solve(factors: ArrowFactors | SparseFactors, right):
@@ -65,12 +65,12 @@ def _solve(factors: ArrowFactors | SparseFactors, right):
     return _solved(factors, right)
 
 
-@eqx.filter_jit
+@program
 def _solved(factors: ArrowFactors, right):
     return factors.solve(right)
 
 
-@eqx.filter_jit
+@program
 def _derivative(problem: Problem, x, quantity):
     return jax.jacrev(lambda y: jnp.ravel(quantity(problem.state(y))))(x)
 
@@ -201,7 +201,7 @@ def effect_deviations(adjustment: Adjustment) -> list[tuple[float, ...]]:
     ]
 
 
-@eqx.filter_jit
+@program
 def _marginals(problem: Problem, factors: ArrowFactors):
     """Square roots of the diagonal of H^-1, in the units of the parameters."""
     s, groups, d = problem.sizes

@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxvm.compiling import program
 from jaxvm.network.unknowns import Unknowns
 from jaxvm.solve.problem import Normal
 
@@ -80,7 +80,7 @@ def named_direction(eigenvalue: float, vector, names: list[str]) -> NullDirectio
     return NullDirection(eigenvalue, tuple(kept))
 
 
-@jax.jit
+@program
 def _spectra(normal: Normal):
     hessian = normal.hessian
     diagonal = hessian.diagonal()

@@ -15,6 +15,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxvm.compiling import program
 from jaxvm.solve.arrow import NormalCholesky
 from jaxvm.solve.problem import Normal, normal_at
 
@@ -215,13 +216,13 @@ def _as_info(normal: Normal):
     return optx.FunctionInfo.EvalGradHessian(normal.cost, normal.gradient, normal.hessian)
 
 
-@eqx.filter_jit
+@program
 def _begin(solver: NormalEquationSolver, info):
     y = jnp.zeros_like(info.grad)
     return y, solver.begin(y, info)
 
 
-@eqx.filter_jit
+@program
 def _advance(solver: NormalEquationSolver, y, state, info):
     return solver.advance(y, state, info)
 

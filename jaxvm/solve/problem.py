@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxvm.compiling import program
 from jaxvm.network.factors import Factor
 from jaxvm.network.residual import Linearised, Network, Residuals, linearise, present, residual
 from jaxvm.network.scene import Scene
@@ -176,14 +177,14 @@ def flat_state(problem: Problem, x: Float[Array, " n"]) -> tuple[Array, Array]:
     return _flat(problem.base, problem.factor, problem.column, problem.active, x)
 
 
-@jax.jit
+@program
 def _flat(base, factor, column, active, x):
     moved = jnp.concatenate([jnp.where(active, x, 0.0), jnp.zeros(1)])
     moving = jnp.concatenate([active, jnp.zeros(1, bool)])[column]
     return base + factor * moved[column], jnp.where(moving, factor, 0.0)
 
 
-@eqx.filter_jit
+@program
 def whitened(raw: list[Linearised], whiten, steps, per_parameter) -> list[Linearised]:
     """Tables in units of their standard deviations, with derivatives by unknowns.
 
@@ -209,7 +210,7 @@ def whitened(raw: list[Linearised], whiten, steps, per_parameter) -> list[Linear
     return result
 
 
-@eqx.filter_jit
+@program
 def assemble(
     tables: list[Linearised],
     packets_of: tuple[Packets, ...],
@@ -358,7 +359,7 @@ def to_unit_diagonal(
     return eqx.tree_at(lambda p: p.factor, problem, problem.factor * per_parameter), scale
 
 
-@jax.jit
+@program
 def _rescale(normal: Normal, scale: Float[Array, " n"]) -> Normal:
     a, b = normal.hessian.split(scale)
     arrow = Arrow(

@@ -14,6 +14,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.stats import chi2
 
+from jaxvm.compiling import program
 from jaxvm.network.factors import LinkFactor
 from jaxvm.network.relations import held_poses, link_relations
 from jaxvm.network.scene import Scene
@@ -64,7 +65,7 @@ def _hats(problem: Problem, x, tables, own) -> list[np.ndarray]:
     return _arrow_hats(hessian, problem.packets, jacobians, problem.sizes)
 
 
-@eqx.filter_jit
+@program
 def _arrow_hats(hessian, packets_of, jacobians, sizes):
     factors = factorise(hessian)
     result = []
