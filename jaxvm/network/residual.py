@@ -88,17 +88,16 @@ def residual(state: State, network: Network) -> Residuals:
     at = present(network, state.flatten())
 
     def whitened(factor: Factor) -> Array:
-        # What is set aside counts nothing, even where it can't be predicted at all.
-        used = factor.weight[:, None] > 0.0
         value = rows(factor, network, at, _used(factor))
-        return jnp.where(used, value, 0.0) * whitening(factor)
+        return _whitened(value, factor.weight, factor.sigma)
 
     return network.residuals([whitened(factor) for factor in network.factors()])
 
 
-def whitening(factor: Factor) -> Float[Array, "observations components"]:
-    """Factor from a residual in its unit to a whitened one: weight / sigma."""
-    return factor.weight[:, None] / factor.sigma
+@program
+def _whitened(value, weight, sigma):
+    # What is set aside counts nothing, even where it can't be predicted at all.
+    return jnp.where(weight[:, None] > 0.0, value, 0.0) * (weight[:, None] / sigma)
 
 
 class Present(NamedTuple):

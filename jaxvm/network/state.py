@@ -12,6 +12,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
+from jaxvm.compiling import program
+
 N_DISTORTION = 14
 """Columns of the distortion table; a lens with fewer coefficients leaves the rest at zero."""
 
@@ -34,7 +36,7 @@ class State(eqx.Module):
 
     def flatten(self) -> Float[Array, " n"]:
         """All values as one vector, in the order of the fields."""
-        return ravel_pytree(self)[0]
+        return _flattened(self)
 
 
 @dataclass(frozen=True)
@@ -85,8 +87,18 @@ class Layout:
 
     def restore(self, flat: Float[Array, " n"]) -> State:
         """State of a flat vector (also under jit)."""
-        fields = {}
-        for name, shape in self.fields:
-            start = self.offset(name)
-            fields[name] = jnp.reshape(flat[start : start + int(np.prod(shape))], shape)
-        return State(**fields)
+        return _restored(self, flat)
+
+
+@program
+def _flattened(state: State):
+    return ravel_pytree(state)[0]
+
+
+@program
+def _restored(layout: Layout, flat) -> State:
+    fields = {}
+    for name, shape in layout.fields:
+        start = layout.offset(name)
+        fields[name] = jnp.reshape(flat[start : start + int(np.prod(shape))], shape)
+    return State(**fields)

@@ -222,7 +222,9 @@ def _moved(found: Adjustment) -> float:
     network, state = found.problem.network, _state(found.problem, found.x)
     anew = eqx.tree_at(patterns, network, patterns(found.scene.network))
     old, new = jax.tree.leaves(residual(state, network)), jax.tree.leaves(residual(state, anew))
-    return sum(float(jnp.sum((b - a) ** 2)) for a, b in zip(old, new, strict=True))
+    return sum(
+        float(np.sum((np.asarray(b) - np.asarray(a)) ** 2)) for a, b in zip(old, new, strict=True)
+    )
 
 
 def _adjusted(

@@ -8,10 +8,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxvm.compiling import program
 from jaxvm.solve.arrow import ArrowFactors
 from jaxvm.solve.problem import Packets, split_columns
 
 
+@program
 def packet_of_rows(packets: Packets, n: int) -> Int[Array, " observations"]:
     """Packet of each row of a table; padding rows get packet 0."""
     number = jnp.arange(packets.rows.shape[0])[:, None]
