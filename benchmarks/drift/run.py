@@ -44,8 +44,7 @@ def poses(made: Made, pixels: np.ndarray) -> np.ndarray:
 
 def one(task: tuple[str, int]) -> dict:
     """Results of one world."""
-    from jaxvm.solve.compiling import forget_compiled_if_many
-
+    from jaxvm.compiling import forget_compiled_if_many
     from jaxvm.identify import compensate, identify
     from jaxvm.identify.identify import CONTINUOUS, DISCRETE
     from jaxvm.recording import read_recording

@@ -21,7 +21,8 @@ import jax
 import meshes
 import stations
 from intervals import RESAMPLES
-from jaxvm.solve.compiling import compile_seconds
+
+from jaxvm.compiling import compile_seconds
 
 HERE = Path(__file__).parent
 

@@ -48,9 +48,9 @@ def fingerprint() -> str:
 
 def show(folder: Path, entry: dict) -> dict:
     """What a recording can show, as plain numbers. Runs in a worker."""
-    from jaxvm.solve.compiling import forget_compiled_if_many
     from power import shown
 
+    from jaxvm.compiling import forget_compiled_if_many
     from jaxvm.recording import read_recording
 
     forget_compiled_if_many()

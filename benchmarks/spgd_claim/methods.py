@@ -19,9 +19,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxvm.solve.compiling import compile_seconds
 from layouts import Layout, reckoned
 
+from jaxvm.compiling import compile_seconds
 from jaxvm.network.cycles import fundamental_cycles
 from jaxvm.network.scene import build
 from jaxvm.solve import condition
