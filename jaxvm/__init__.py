@@ -15,8 +15,10 @@ need it. The settings below are made unless the environment already has them:
   by page, which costs more than what is computed in them: up to 64 MB they are kept, for all
   threads together.
 
-Compiled programs stay in the user's cache folder, so that a second run starts at once;
-JAX_COMPILATION_CACHE_DIR names another folder, JAX_ENABLE_COMPILATION_CACHE=false keeps none.
+Compiled programs stay in the user's cache folder, so that a second run starts at once
+(`jaxvm.compiling`); JAX_COMPILATION_CACHE_DIR names another folder,
+JAX_ENABLE_COMPILATION_CACHE=false keeps none. Executables are loaded from there: it is a folder for
+its user alone.
 """
 
 import ctypes
