@@ -31,6 +31,14 @@ from jax.core import Tracer
 from jax.experimental import serialize_executable
 from jax.experimental.compilation_cache import compilation_cache
 
+_OURS = frozenset(
+    "jaxvm jax jaxlib equinox optimistix lineax numpy builtins collections functools".split()
+)
+"""Packages whose functions and types are told by their names: `_context` tells their sources.
+
+What the function of a user does may be another thing tomorrow, under the same name.
+"""
+
 _everything: list["program"] = []
 _alone = threading.Lock()  # one thread at a time goes without JAX's cache
 
@@ -39,9 +47,9 @@ class program:  # noqa: N801 (a decorator)
     """As `equinox.filter_jit`, and the executable is kept for other processes.
 
     Arrays are arguments of the program, all else is static. It is kept on the CPU of one device,
-    where arguments name what they consist of (no local functions); under a transformation of JAX,
-    and elsewhere, this is `equinox.filter_jit` itself. JAX_ENABLE_COMPILATION_CACHE=false keeps
-    nothing.
+    where all that is static is known by name (no functions of users, whose meaning may change, and
+    no local ones); under a transformation of JAX, and elsewhere, this is `equinox.filter_jit`
+    itself. JAX_ENABLE_COMPILATION_CACHE=false keeps nothing.
     """
 
     def __init__(self, function: Callable):
@@ -236,13 +244,8 @@ def _described(value: Any) -> str | None:
         return _listed("dict", [part for item in value.items() for part in item])
     if isinstance(value, functools.partial):
         return _listed("partial", (value.func, value.args, value.keywords))
-    if isinstance(value, type):
-        local = "<locals>" in value.__qualname__
-        return None if local else f"type {value.__module__}:{value.__qualname__}"
-    if isinstance(value, FunctionType):
-        # Told by its name where the name leads to it: not a local one.
-        found = _named(value.__module__, value.__qualname__)
-        return f"function {value.__module__}:{value.__qualname__}" if found is value else None
+    if isinstance(value, type | FunctionType):
+        return _name_of(value)
     if isinstance(value, eqx.Module):
         return _listed("module", jax.tree.flatten(value))
     if dataclasses.is_dataclass(value):
@@ -253,11 +256,16 @@ def _described(value: Any) -> str | None:
     return None
 
 
-def _named(module: str, name: str) -> Any:
-    found = sys.modules.get(module)
-    for part in name.split("."):
+def _name_of(value: Any) -> str | None:
+    """Where a function or type is found, if that is what its name leads to (no local one)."""
+    if value.__module__.split(".")[0] not in _OURS or "<" in value.__qualname__:
+        return None
+    found = sys.modules.get(value.__module__)
+    for part in value.__qualname__.split("."):
         found = getattr(found, part, None)
-    return found
+    # Some types that JAX registers have no name of their own there (NoneType).
+    same = found is value or isinstance(value, type)
+    return f"{value.__module__}:{value.__qualname__}" if same else None
 
 
 def _listed(kind: str, values) -> str | None:

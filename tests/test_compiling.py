@@ -48,9 +48,10 @@ def doubled(x):
 
 
 @pytest.fixture(autouse=True)
-def _kept(tmp_path):
-    """Programs of a test stay in a folder of its own."""
+def _kept(tmp_path, monkeypatch):
+    """Programs of a test stay in a folder of its own; types of this file count as known."""
     _traced.clear()
+    monkeypatch.setattr(compiling, "_OURS", compiling._OURS | {__name__})
     before = jax.config.values["jax_compilation_cache_dir"]
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
     _forget()
@@ -123,6 +124,21 @@ def test_a_damaged_file_is_made_again(tmp_path, damage):
     _forget()
     np.testing.assert_array_equal(solved(np.eye(3), x)[0], x)
     assert _traced == ["solved"] * 2
+
+
+def tripled(x):
+    return 3.0 * x
+
+
+def test_what_a_user_wrote_is_traced_anew(monkeypatch):
+    """Its name says nothing about what it does tomorrow."""
+    monkeypatch.setattr(compiling, "_OURS", compiling._OURS - {__name__})
+    x = np.arange(3.0)
+    assert through(doubled, x)[2] == 4.0
+    _forget()
+    monkeypatch.setattr(tripled, "__qualname__", "doubled")
+    monkeypatch.setitem(globals(), "doubled", tripled)
+    assert through(doubled, x)[2] == 6.0
 
 
 def test_functions_of_modules_are_told_apart_and_local_ones_not_kept():
