@@ -23,7 +23,7 @@ from networks import (
 from scipy.linalg import logm
 
 from jaxvm.network.factors import PixelFactor, RangeFactor
-from jaxvm.network.residual import linearise, present, residual
+from jaxvm.network.residual import linearise, present, residual, whitening
 from jaxvm.network.scene import build
 from jaxvm.physics.effects import Effect, Scope, Term
 from jaxvm.physics.ports import N_PORTS, PORTS
@@ -62,8 +62,7 @@ def assembled_jacobian(flat, network):
     for factor in network.factors():
         n, own = factor.slots.shape
         live = tuple(range(own + len(effects)))
-        scale = factor.weight[:, None] / factor.sigma
-        block = linearised(factor, network, flat, live).jacobian * scale[:, :, None]
+        block = linearised(factor, network, flat, live).jacobian * whitening(factor)[:, :, None]
         slots = jnp.concatenate(
             [factor.slots, jnp.broadcast_to(jnp.asarray(effects, int), (n, len(effects)))], axis=1
         )
@@ -199,7 +198,7 @@ def test_port_jacobian_is_the_derivative_by_an_effect_on_each_port(stereo):
     amplitude = with_all.network.layout.all("amplitude")[:N_PORTS]
     tangents = [
         linearised(f, scene.network, scene.state.flatten(), tangent=True).tangent
-        * (f.weight[:, None] / f.sigma)[:, :, None]
+        * whitening(f)[:, :, None]
         for f in scene.network.factors()
         if isinstance(f, PixelFactor | RangeFactor)
     ]

@@ -94,10 +94,20 @@ def residual(state: State, network: Network) -> Residuals:
     return network.residuals([whitened(factor) for factor in network.factors()])
 
 
+def whitening(factor: Factor) -> Float[Array, "observations components"]:
+    """Factor from a residual in its unit to a whitened one: weight / sigma."""
+    return _scale(factor.weight, factor.sigma)
+
+
+@program
+def _scale(weight, sigma):
+    return weight[:, None] / sigma
+
+
 @program
 def _whitened(value, weight, sigma):
     # What is set aside counts nothing, even where it can't be predicted at all.
-    return jnp.where(weight[:, None] > 0.0, value, 0.0) * (weight[:, None] / sigma)
+    return jnp.where(weight[:, None] > 0.0, value, 0.0) * _scale(weight, sigma)
 
 
 class Present(NamedTuple):
