@@ -18,7 +18,7 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 from types import FunctionType
-from typing import Any
+from typing import Any, Generic, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
@@ -30,6 +30,9 @@ import optimistix
 from jax.core import Tracer
 from jax.experimental import serialize_executable
 from jax.experimental.compilation_cache import compilation_cache
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 _OURS = frozenset(
     "jaxvm jax jaxlib equinox optimistix lineax numpy builtins collections functools".split()
@@ -43,7 +46,7 @@ _everything: list["program"] = []
 _alone = threading.Lock()  # one thread at a time goes without JAX's cache
 
 
-class program:  # noqa: N801 (a decorator)
+class program(Generic[P, R]):  # noqa: N801 (a decorator)
     """As `equinox.filter_jit`, and the executable is kept for other processes.
 
     Arrays are arguments of the program, all else is static. It is kept on the CPU of one device,
@@ -52,7 +55,7 @@ class program:  # noqa: N801 (a decorator)
     itself. JAX_ENABLE_COMPILATION_CACHE=false keeps nothing.
     """
 
-    def __init__(self, function: Callable):
+    def __init__(self, function: Callable[P, R]):
         self._function = function
         self._name = f"{function.__module__}:{function.__qualname__}"
         self._traced = eqx.filter_jit(function)
@@ -60,7 +63,7 @@ class program:  # noqa: N801 (a decorator)
         functools.update_wrapper(self, function)
         _everything.append(self)
 
-    def __call__(self, *args, **kwargs):
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
         settings: Any = jax.config
         if settings.jax_disable_jit or settings.jax_debug_nans:
             return self._traced(*args, **kwargs)
@@ -112,6 +115,8 @@ class program:  # noqa: N801 (a decorator)
             name = _digest(_compiler(), text)
             # Other sources may have asked for the same program.
             found = _executable(folder / name) or _compiled(lowered, folder / name)
+            if found is None:
+                return "traced"
             _write(known, (name, result))
         others, structure = jax.tree.flatten(result)
         return found, structure, others
@@ -119,13 +124,14 @@ class program:  # noqa: N801 (a decorator)
     def _lowered(self, structure, leaves):
         """From arrays to arrays, and the result with `...` in their places."""
         result = None
+        function: Callable[..., Any] = self._function
 
         def flat(*arrays):
             nonlocal result
             given = iter(arrays)
             merged = [next(given) if eqx.is_array(leaf) else leaf for leaf in leaves]
             args, kwargs = jax.tree.unflatten(structure, merged)
-            found, others = eqx.partition(self._function(*args, **kwargs), eqx.is_array)
+            found, others = eqx.partition(function(*args, **kwargs), eqx.is_array)
             result = eqx.combine(jax.tree.map(lambda _: ..., found), others)
             return jax.tree.leaves(found)
 
@@ -149,7 +155,7 @@ def _with_lapack() -> None:
 
 
 def _compiled(lowered, file: Path):
-    """The executable of a lowered program, kept in a file."""
+    """The executable of a lowered program, kept in a file; None where JAX can't write it."""
     # What JAX's cache has loaded can't be written again: its machine code is gone by then.
     with _alone:
         jax.config.update("jax_enable_compilation_cache", False)
@@ -161,8 +167,8 @@ def _compiled(lowered, file: Path):
             compilation_cache.reset_cache()
     try:
         _write(file, serialize_executable.serialize(executable))
-    except (ValueError, NotImplementedError):
-        pass  # such a program is compiled by every process
+    except (ValueError, NotImplementedError):  # e.g. with constants as arguments
+        return None
     return executable
 
 
@@ -177,9 +183,10 @@ def _read(file: Path) -> Any:
 def _write(file: Path, content) -> None:
     """Write in one piece or not at all: other processes may be looking."""
     try:
-        with tempfile.NamedTemporaryFile(dir=file.parent, delete=False) as whole:
-            whole.write(pickle.dumps(content))
-        os.replace(whole.name, file)
+        with tempfile.TemporaryDirectory(dir=file.parent) as apart:
+            whole = Path(apart, file.name)
+            whole.write_bytes(pickle.dumps(content))
+            os.replace(whole, file)
     except (OSError, pickle.PicklingError):
         return
 

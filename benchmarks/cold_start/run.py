@@ -1,8 +1,8 @@
 """How long does a user wait for the first result, with nothing compiled, and later?
 
-Whole processes of `jaxvm demo` (88,000 hypotheses, a report page): first with an
-empty folder for programs, then five times with it (the median counts), and between them five times
-with JAX's own cache alone, where every process traces and lowers its programs anew.
+Whole processes of `jaxvm demo` (88,000 hypotheses, a report page): first with an empty folder for
+programs, then five times with it (the median counts), and between them five times with JAX's own
+cache alone, where every process traces and lowers its programs anew.
 """
 
 import json
