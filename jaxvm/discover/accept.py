@@ -14,9 +14,9 @@ _CANDIDATES = 4
 _NEAR = 30.0
 
 STRONG = 20.0
-"""Evidence at which what never changes needs held-out epochs only not to speak against it.
+"""Evidence from which the held-out epochs are asked for their odds where their errors don't tell.
 
-It can't follow the noise of single epochs, and the held-out third alone shows a weak effect badly.
+The held-out third alone shows a weak effect badly, and worst where its forecast is vague.
 """
 
 _FREE_LEAST, _FREE_LEAST_OF_EPOCHS = 20.0, 30.0
@@ -82,9 +82,11 @@ def accept(
         for candidate in sorted(refitted, key=lambda c: -_common_evidence(c, refitted, current)):
             shown = split.evaluate(candidate.adjustment.scene)
             proof = gain(heldout, shown, seed)
-            fixed = candidate.hypothesis.course.driver == "constant"
-            hopeful = fixed and candidate.evidence > STRONG and proof.probability > 0.5
-            if (proof.proven or hopeful) and _is_determined(candidate, shown):
+            few = len(candidate.amplitudes) <= FREE
+            if few and candidate.evidence > STRONG and not proof.proven:
+                after = replace(candidate.adjustment, scene=shown.scene)
+                proof = replace(proof, odds=split.odds(current, after))
+            if proof.proven and _is_determined(candidate, shown):
                 gap = max(_OPEN[0], _OPEN[1] * abs(candidate.evidence))
                 others = tuple(
                     c

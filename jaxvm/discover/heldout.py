@@ -49,6 +49,8 @@ class Gain:
         before_px, after_px: weighted RMS.
         share: share of the sum of squares that went, with its 95 % interval.
         probability: of an improvement, by the bootstrap.
+        odds: twice the logarithm of the odds that the held-out epochs give (`Split.odds`); 0 where
+            they were not asked for.
     """
 
     before_px: float
@@ -56,16 +58,17 @@ class Gain:
     share: float
     interval: tuple[float, float]
     probability: float
+    odds: float = 0.0
 
     @property
     def proven(self) -> bool:
-        """Whether the held-out epochs agree that it improves.
+        """Whether the held-out epochs agree that it improves: by their errors, or by their odds.
 
         The significance of a finding is tested on the fitted epochs; the held-out ones are fewer
         and only have to confirm it. A demand of 97.5 % here would lose every second effect that
         the test has rightly found near its limit.
         """
-        return self.probability >= CONFIRMED
+        return self.probability >= CONFIRMED or self.odds > 0.0
 
 
 @dataclass(frozen=True)
@@ -120,6 +123,32 @@ class Split:
         """The fit with the epochs set aside evaluated, and their poses taken over."""
         heldout = self.evaluate(fitted.scene)
         return replace(fitted, scene=heldout.scene), heldout
+
+    def odds(self, before: Adjustment, after: Adjustment) -> float:
+        """Twice the log of the odds that the held-out epochs give to what a fit has more.
+
+        That is 2 ln p(held | fitted, after) - 2 ln p(held | fitted, before), the density of each
+        model's forecast taken with the uncertainty that the fitted epochs leave in all it knows
+        (partial Bayes factor; O'Hagan 1995, eq. 2). Sums of squared errors, which know nothing of
+        it, drown what is new wherever a forecast is vague. By the chain rule of probability it is
+        what chi-square drops by in all epochs together, less what it drops by in the fitted ones,
+        less what the further epochs sharpen the new unknowns by.
+
+        Args:
+            before, after: fits to the fitted epochs; the effects of `after` are those of `before`
+                and more.
+        """
+        everything = split(before.scene, np.zeros(len(self.held), bool), self.sound)
+        drops = [
+            2.0 * (one.cost - other.cost) / after.variance_factor
+            for one, other in (
+                (before, after),
+                (everything.fit(before.scene), everything.fit(after.scene)),
+            )
+        ]
+        new = [e.n_columns + len(e.constants) for e in after.scene.effects]
+        new = sum(new[len(before.scene.effects) :])
+        return float(drops[1] - drops[0] - new * np.log(everything.n / self.n))
 
     def residuals(self, fitted: Adjustment) -> np.ndarray:
         """Whitened residuals [observations, 2] of the fitted epochs; NaN where not fitted."""

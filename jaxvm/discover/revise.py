@@ -146,12 +146,14 @@ def likelier(
 ) -> tuple[Adjustment, list[Finding]]:
     """Findings whose k-th has the name of a double that is clearly likelier than what fits best.
 
-    What fits best by a little may be the less plausible one by far.
+    What fits best by a little may be the less plausible one by far. One that has a name leads what
+    has none as soon as it is as likely.
     """
     finding, scene = findings[k], current.scene
     named = [rival for rival in finding.rivals if rival.hypothesis.entries]
     best = max(named, key=lambda rival: rival.weight, default=None)
-    if best is None or best.weight < _LIKELIER * finding.weight:
+    odds = _LIKELIER if finding.hypothesis.entries else 1.0
+    if best is None or best.weight < odds * finding.weight:
         return current, findings
     effects = list(scene.fitted_effects())
     effects[len(effects) - len(findings) + k] = best.hypothesis.effect(

@@ -11,6 +11,7 @@ from jaxvm.discover.diagnosis import Finding
 from jaxvm.discover.doubt import doubted
 from jaxvm.discover.finer import at_finer_constants, said, with_slow_beginnings
 from jaxvm.discover.heldout import HeldOut, Split, gain
+from jaxvm.discover.hypotheses import FREE
 from jaxvm.discover.noise import Correlation, Met, met, random_signs
 from jaxvm.discover.pairs import better_pair, other_beginnings, worth_a_second_thought
 from jaxvm.discover.ranking import Ranking, spread_of_constant, surprise
@@ -37,6 +38,9 @@ _WIDER = 1.2
 
 _TURNS = 3
 """Findings that in turn only took the place of another, until they are as good as each other."""
+
+_LEADING, _NAMES = 60, 3
+"""Leading hypotheses among which names are looked for, and names tried for what has none."""
 
 FLIPS = 199
 """Repetitions of the null distribution."""
@@ -360,7 +364,30 @@ class Search:
 
     def _rename(self) -> None:
         """Better names beside all the others."""
+        self.findings = [self._with_names_to_try(k) for k in range(len(self.findings))]
         self._take_over(*rename(self.current, self.findings, self.parts.n, self.parts.fit))
+
+    def _with_names_to_try(self, k: int) -> Finding:
+        """A finding without a name, with the named ones that lead at its place beside the others.
+
+        While others were missing, a stranger's sensor and a play of its own may have led, and what
+        was not near then is near now.
+        """
+        finding, scene = self.findings[k], self.current.scene
+        if finding.hypothesis.entries or followed(self.findings, k):
+            return finding
+        without = self._without(k)
+        variance = robust_variance(without)
+        ranking = self._tests.at(without).score(variance)
+        foremost = shortlist(ranking, scene, variance, self.parts.n, _LEADING, FREE)
+        named = [h for h, *_ in foremost if h.entries and h.scope == finding.hypothesis.scope]
+        return replace(finding, alternatives=(*named[:_NAMES], *finding.alternatives))
+
+    def _without(self, k: int) -> Adjustment:
+        """The fit with all findings but one."""
+        effects, scene = self.current.scene.fitted_effects(), self.current.scene
+        others = (*effects[: self.given + k], *effects[self.given + k + 1 :])
+        return self.parts.fit(scene.with_effects(others, scene.room))
 
     def _lead_with_the_likeliest(self) -> None:
         """Doubles that are likelier than what fits best lead, if held-out epochs say no other."""
@@ -383,9 +410,7 @@ class Search:
         finding, scene, parts = self.findings[k], self.current.scene, self.parts
         if followed(self.findings, k):
             return finding
-        effects = scene.fitted_effects()
-        others = (*effects[: self.given + k], *effects[self.given + k + 1 :])
-        without = parts.fit(scene.with_effects(others, scene.room))
+        without = self._without(k)
         shown = [
             (r.hypothesis, np.zeros(0), 2.0 * np.log(max(finding.weight, 1e-9) / r.weight))
             for r in finding.rivals
@@ -394,7 +419,7 @@ class Search:
             without,
             self.current,
             finding.hypothesis,
-            effects[self.given + k],
+            scene.fitted_effects()[self.given + k],
             self._tests.at(without),
             parts.n,
             shown,

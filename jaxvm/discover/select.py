@@ -17,6 +17,7 @@ from jaxvm.network.scene import Scene
 from jaxvm.physics.catalogue import Entry
 from jaxvm.physics.effects import Effect, room_for
 from jaxvm.physics.forms import FORMS, N_KNOTS
+from jaxvm.physics.ports import PORT_INDEX, PORTS
 from jaxvm.solve.adjust import Adjustment, adjust
 
 DECIDED = 2.0 * np.log(20.0)
@@ -96,8 +97,13 @@ def log_prior(hypothesis: Hypothesis, amplitudes: np.ndarray) -> float:
 
 
 def _log_size(entry: Entry, hypothesis: Hypothesis, amplitudes: np.ndarray) -> float:
-    """Log plausibility of an effect's size under one of its names."""
-    size = float(np.linalg.norm(amplitudes[:: len(FORMS[hypothesis.course.form].bases)]))
+    """Log plausibility of an effect's size under one of its names.
+
+    Of terms of several units those count that have the unit in which the size is given.
+    """
+    units = [PORTS[PORT_INDEX[term.port]].unit for term in hypothesis.group.terms]
+    first = amplitudes[:: len(FORMS[hypothesis.course.form].bases)]
+    size = float(np.linalg.norm([a for a, u in zip(first, units, strict=False) if u == units[0]]))
     if size == 0.0:
         return 0.0
     low, high = entry.plausible

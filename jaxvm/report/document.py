@@ -110,6 +110,7 @@ def _finding(finding: Finding) -> dict[str, Any]:
         "shared": finding.sharing.words() if finding.sharing else "",
         "explanation": explanation(finding),
         "heldout_rms_px": {"before": gain.before_px, "after": gain.after_px},
+        "heldout_log_odds": 0.5 * gain.odds if gain.odds else None,
         "heldout_share": {"value": gain.share, "interval_95": list(gain.interval)},
         "ranking": [{"hypothesis": words, "evidence": e} for words, e in finding.ranking],
     }

@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxvm.discover.collocation import Signal
 from jaxvm.discover.diagnosis import Diagnosis, Finding
+from jaxvm.discover.heldout import Gain
 from jaxvm.discover.scatter import ALIKE
 from jaxvm.discover.shape import shape_words
 from jaxvm.physics.catalogue import BY_ID
@@ -223,6 +224,18 @@ def odds(value: float) -> str:
     return f"{value:.1f}:1" if value < 10.0 else f"{min(value, 1e6):,.0f}:1"
 
 
+def proof(gain: Gain) -> str:
+    """What the held-out epochs say: their errors and, where these don't tell, their odds."""
+    low, high = (100.0 * bound for bound in gain.interval)
+    words = (
+        f"{gain.before_px:.4f} px -> {gain.after_px:.4f} px "
+        f"({low:.1f} to {high:.1f} % of chi-square, 95 %)"
+    )
+    if gain.odds > 0.0:
+        words += f"; odds of the two forecasts {odds(math.exp(0.5 * min(gain.odds, 100.0)))}"
+    return words
+
+
 def signal_parameters(signal: Signal, diagnosis: Diagnosis) -> list[Parameter]:
     """Numbers of what the marks of an image share at random."""
     cameras = diagnosis.recording.model.cameras
@@ -243,7 +256,6 @@ def signal_rows(diagnosis: Diagnosis) -> list[tuple[str, str]]:
         return []
     gain, values = signal.gain, signal_parameters(signal, diagnosis)
     sizes = "; ".join(f"{p.name} {quantity(p.value, p.std, p.unit)}" for p in values)
-    low, high = (100 * bound for bound in gain.interval)
     return [
         ("where", "everywhere; seen by the cameras that are named with their sizes"),
         ("when", SIGNAL_WHEN),
@@ -256,8 +268,7 @@ def signal_rows(diagnosis: Diagnosis) -> list[tuple[str, str]]:
         ),
         (
             "proof",
-            f"held-out {gain.before_px:.4f} px -> {gain.after_px:.4f} px "
-            f"({low:.1f} to {high:.1f} % of chi-square, 95 %)",
+            f"held-out {proof(gain)}",
         ),
         ("separate", HAZE.separate_by),
     ]
@@ -343,8 +354,7 @@ def summary(diagnosis: Diagnosis) -> str:
             f"   explains  {100 * finding.share:.0f} % of the excess chi-square, "
             f"{in_pixels(finding):.3f} px RMS; p = {finding.p_value:.2g}, family-wise, "
             f"of {finding.n_hypotheses:,} hypotheses",
-            f"   proof     held-out {gain.before_px:.4f} px -> {gain.after_px:.4f} px "
-            f"({100 * gain.interval[0]:.1f} to {100 * gain.interval[1]:.1f} % of chi-square, 95 %)",
+            f"   proof     held-out {proof(gain)}",
         ]
         if finding.rivals:
             alike = "; ".join(doubles(finding))

@@ -20,6 +20,14 @@ RANGE: tuple[Entry, ...] = (
         "All distances are wrong by the same amount.",
     ),
     Entry(
+        "range-penetration", "the beam enters the surface", (91,),
+        ((Term("range.offset"), Term("range.offset", "incidence", "square")),),
+        ALWAYS, ALWAYS, "rangefinder",
+        (5e-5, 1e-2), "index error", "tilt the surface; an opaque one",
+        "The light turns back within a foil, a foam or a plastic. Its way there is longer the more "
+        "aslant it enters, on top of a part that is always the same.",
+    ),
+    Entry(
         "range-drift", "the rangefinder's index drifts with temperature", (87,),
         _INDEX, ("temperature",), THERMAL, "rangefinder",
         (5e-6, 1e-3), "motion of the target", "a fixed baseline",

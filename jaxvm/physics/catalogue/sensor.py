@@ -182,7 +182,7 @@ SENSOR: tuple[Entry, ...] = (
     Entry(
         "frame-slip", "the camera lost a frame", (60,),
         _DELAY, ("time",), ("step",), "camera",
-        (1e-3, 1.0), "a single bad image", "number the frames in the device",
+        (4e-3, 1.0), "a single bad image", "number the frames in the device",
         "From one moment on each image is paired with the time of its neighbour. The delay jumps "
         "by whole periods of the frame rate.",
     ),

@@ -20,7 +20,11 @@ _MARK = (
     plain("target.point_x", "target.point_y"),
     plain("target.point_z"),
 )
-_PLACE = axes("structure.shift", "structure.turn")
+_PLACE = (
+    *axes("structure.shift", "structure.turn"),
+    *(plain(f"target.point_{axis}") for axis in "xyz"),
+)
+"""Where a target is: in the world, and along its own axes, as a plate slides in its plane."""
 
 TARGET: tuple[Entry, ...] = (
     Entry(

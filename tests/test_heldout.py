@@ -1,0 +1,139 @@
+"""The held-out epochs' word: the odds of two forecasts, each with its own uncertainty."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from networks import board_recording
+
+from jaxvm.discover.accept import STRONG, _is_determined, accept
+from jaxvm.discover.courses import Course
+from jaxvm.discover.diagnose import _plain_fit
+from jaxvm.discover.groups import Group
+from jaxvm.discover.heldout import gain, weights_of
+from jaxvm.discover.hypotheses import Hypothesis
+from jaxvm.discover.select import refit
+from jaxvm.network.residual import predict_pixels
+from jaxvm.physics.catalogue import entries_for
+from jaxvm.physics.effects import Effect, Scope, Term
+from jaxvm.solve.problem import scene_problem
+
+FOCAL = (Term("sensor.focal"),)
+CAMERA = Scope(camera=("cam",))
+AGES = Hypothesis(
+    Group(FOCAL, "camera"),
+    Course("time", "linear"),
+    CAMERA,
+    entries_for(FOCAL, "camera", ("time",), "linear"),
+)
+
+
+@pytest.fixture(scope="module")
+def known():
+    return board_recording(n_epochs=24)
+
+
+def drawn(known, per_second: float, seed: int):
+    """The split, the plain fit and that with the drift, of a camera whose focal length drifts."""
+    plain = known.true_scene()
+    drift = Effect("drift", FOCAL, "time", "linear", (), 0.0, CAMERA, (per_second,))
+    truth = plain.with_effects((drift,), (16, 8))
+    obs = known.recording.observations
+    pixel = np.zeros(obs.pixel.shape)
+    for rows, own in zip(truth.tables, predict_pixels(truth.state, truth.network), strict=True):
+        pixel[rows] = np.asarray(own)[: len(rows)]
+    pixel += obs.sigma[:, None] * np.random.default_rng(seed).standard_normal(pixel.shape)
+    recording = replace(known.recording, observations=replace(obs, pixel=pixel))
+    scene = known.true_scene(recording).with_effects((), (16, 8))
+    parts, before, _ = _plain_fit(scene, 3)
+    before, _ = parts.proven(before)
+    found = refit(before, AGES, np.zeros(1), parts)
+    assert found is not None
+    after, _ = parts.proven(found.adjustment)
+    return parts, before, after, found
+
+
+def stacked(problem, x):
+    """All whitened residuals in one vector, pixels first."""
+    return jnp.concatenate([jnp.ravel(block) for block in jax.tree.leaves(problem.residual(x))])
+
+
+def log_density(scene, parts, variance: float) -> float:
+    """2 ln p(held-out epochs | fitted ones), but for what all models have in common.
+
+    By dense matrices: what the fitted epochs leave open of the unknowns widens the forecast; the
+    poses of the held-out epochs are unknown.
+    """
+    problem = scene_problem(scene)
+    at = np.zeros(problem.n)
+    residual = np.asarray(stacked(problem, at))
+    jacobian = np.asarray(jax.jacfwd(lambda x: stacked(problem, x))(at))
+    held = np.zeros(len(residual), bool)
+    begin = 0
+    aside = weights_of(scene, parts.held, parts.sound)
+    used = np.ones(len(residual), bool)
+    for factor, weight in zip(scene.network.pixels, aside, strict=True):
+        n = 2 * len(np.asarray(factor.weight))
+        own = slice(begin, begin + 2 * len(weight))
+        held[own] = np.repeat(weight > 0, 2)
+        used[own] = np.repeat(np.concatenate(parts.sound) > 0, 2)
+        begin += n
+    fitted = used & ~held
+    ours = ~np.any(jacobian[fitted] != 0.0, axis=0)
+    theirs = ~ours & np.any(jacobian != 0.0, axis=0)
+    ours &= np.any(jacobian[held] != 0.0, axis=0)
+    known = jacobian[fitted][:, theirs]
+    spread = np.linalg.inv(known.T @ known)
+    # The fit is at its minimum: what is expected of the held-out residuals is what they are there.
+    open_ = jacobian[held][:, theirs]
+    total = variance * (np.eye(held.sum()) + open_ @ spread @ open_.T)
+    free = jacobian[held][:, ours]
+    weight = np.linalg.inv(total)
+    normal = free.T @ weight @ free
+    left = residual[held] - free @ np.linalg.solve(normal, free.T @ weight @ residual[held])
+    determinants = np.linalg.slogdet(total)[1] + np.linalg.slogdet(normal)[1]
+    return float(-left @ weight @ left - determinants)
+
+
+@pytest.mark.parametrize("per_second", [0.0, 3e-4, 1e-3])
+def test_the_odds_are_those_of_the_two_forecasts(known, per_second):
+    parts, before, after, _ = drawn(known, per_second, seed=4)
+    dense = [log_density(fit.scene, parts, after.variance_factor) for fit in (after, before)]
+    # The determinants are taken to grow with the number of observations.
+    assert parts.odds(before, after) == pytest.approx(dense[0] - dense[1], abs=0.1)
+
+
+def test_noise_gets_odds_against_it_and_an_effect_odds_for_it(known):
+    odds = {size: [drawn_odds(known, size, seed) for seed in range(12)] for size in (0.0, 1e-3)}
+    assert np.mean(odds[0.0]) < 0.0 and np.max(odds[0.0]) < 6.0
+    assert np.mean(odds[1e-3]) > 10.0 and np.mean(np.array(odds[1e-3]) > 0.0) > 0.9
+
+
+@pytest.mark.parametrize("seed", [14, 18])
+def test_odds_prove_what_errors_alone_can_not(known, seed, monkeypatch):
+    parts, before, after, found = drawn(known, 8e-4, seed)
+    heldout = parts.evaluate(before.scene)
+    errors = gain(heldout, parts.evaluate(after.scene))
+    assert not errors.proven and found.evidence > STRONG
+    leading = [(AGES, found.evidence, found.amplitudes)]
+    accepted = accept(before, leading, parts, heldout, 0, set())
+    assert not isinstance(accepted, str) and accepted.gain.odds > 0.0
+    assert accepted.gain.probability == errors.probability
+    monkeypatch.setattr("jaxvm.discover.accept.STRONG", 2.0 * found.evidence)
+    assert isinstance(accept(before, leading, parts, heldout, 0, set()), str)
+
+
+def test_what_no_epoch_shows_has_no_size(known):
+    parts, before, _, found = drawn(known, 8e-4, seed=14)
+    late = Effect("late", FOCAL, "time", "step", (1e4,), 0.0, CAMERA, (0.0,))
+    unseen = parts.fit(before.scene.with_effects((late,), (16, 8)))
+    for candidate, determined in ((found, True), (replace(found, adjustment=unseen), False)):
+        shown = parts.evaluate(candidate.adjustment.scene)
+        assert _is_determined(candidate, shown) is determined
+
+
+def drawn_odds(known, per_second, seed):
+    parts, before, after, _ = drawn(known, per_second, seed)
+    return parts.odds(before, after)
