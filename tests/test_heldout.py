@@ -118,11 +118,12 @@ def test_odds_prove_what_errors_alone_can_not(known, seed, monkeypatch):
     errors = gain(heldout, parts.evaluate(after.scene))
     assert not errors.proven and found.evidence > STRONG
     leading = [(AGES, found.evidence, found.amplitudes)]
-    accepted = accept(before, leading, parts, heldout, 0, set())
+    assert isinstance(accept(before, leading, parts, heldout, 0, set()), str)
+    accepted = accept(before, leading, parts, heldout, 0, set(), ask_odds=True)
     assert not isinstance(accepted, str) and accepted.gain.odds > 0.0
     assert accepted.gain.probability == errors.probability
     monkeypatch.setattr("jaxvm.discover.accept.STRONG", 2.0 * found.evidence)
-    assert isinstance(accept(before, leading, parts, heldout, 0, set()), str)
+    assert isinstance(accept(before, leading, parts, heldout, 0, set(), ask_odds=True), str)
 
 
 def test_what_no_epoch_shows_has_no_size(known):

@@ -52,11 +52,25 @@ class Accepted:
 
 
 def accept(
-    current: Adjustment, leading, split: Split, heldout: HeldOut, seed: int, hopeless: set
+    current: Adjustment,
+    leading,
+    split: Split,
+    heldout: HeldOut,
+    seed: int,
+    hopeless: set,
+    ask_odds: bool = False,
 ) -> Accepted | str:
     """The best candidate that improves the held-out epochs, or the name of the one that failed.
 
-    `hopeless` collects what can't be fitted or does not help there; it is not tried again.
+    Args:
+        current: the fit so far.
+        leading: hypotheses with the evidence foretold and one-step amplitudes, best first.
+        split, heldout: what is fitted, and the errors of the fit so far on what is not.
+        seed: of the bootstrap.
+        hopeless: collects what can't be fitted or does not help there; it is not tried again.
+        ask_odds: whether errors that don't tell leave it to the odds. These suppose noise that is
+            the same in all epochs: where what differs from image to image is still to be found,
+            whatever happens to follow it has odds for it.
     """
     # One tangent foretells a drop to a few percent: only near ties of the leading one need a refit.
     # Where none of them passes, named physics gets its turn; an unnamed effect must lead.
@@ -82,8 +96,8 @@ def accept(
         for candidate in sorted(refitted, key=lambda c: -_common_evidence(c, refitted, current)):
             shown = split.evaluate(candidate.adjustment.scene)
             proof = gain(heldout, shown, seed)
-            few = len(candidate.amplitudes) <= FREE
-            if few and candidate.evidence > STRONG and not proof.proven:
+            strong = candidate.evidence > STRONG and len(candidate.amplitudes) <= FREE
+            if ask_odds and strong and not proof.proven:
                 after = replace(candidate.adjustment, scene=shown.scene)
                 proof = replace(proof, odds=split.odds(current, after))
             if proof.proven and _is_determined(candidate, shown):

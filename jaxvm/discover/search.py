@@ -157,7 +157,16 @@ class Search:
             return None
         number = self.ranking.n
         progress(f"{number} hypotheses, p = {self.p_value:.3g}: refitting the leading ones")
-        found = accept(self.current, leading, self.parts, self.heldout, self.seed, self._hopeless)
+        found = accept(
+            self.current,
+            leading,
+            self.parts,
+            self.heldout,
+            self.seed,
+            self._hopeless,
+            # Under random signs with all that is there, not only under what is left.
+            ask_odds=self.ranking.p_value(self.ranking.best_z()) <= self.alpha,
+        )
         if isinstance(found, str):
             self.unproven = self.unproven or found
             return None
