@@ -68,9 +68,9 @@ def accept(
         split, heldout: what is fitted, and the errors of the fit so far on what is not.
         seed: of the bootstrap.
         hopeless: collects what can't be fitted or does not help there; it is not tried again.
-        ask_odds: whether errors that don't tell leave it to the odds. These suppose noise that is
-            the same in all epochs: where what differs from image to image is still to be found,
-            whatever happens to follow it has odds for it.
+        ask_odds: whether errors that are hardly smaller leave it to the odds. These suppose noise
+            that is the same in all epochs: where what differs from image to image is still to be
+            found, whatever happens to follow it has odds for it.
     """
     # One tangent foretells a drop to a few percent: only near ties of the leading one need a refit.
     # Where none of them passes, named physics gets its turn; an unnamed effect must lead.
@@ -97,7 +97,7 @@ def accept(
             shown = split.evaluate(candidate.adjustment.scene)
             proof = gain(heldout, shown, seed)
             strong = candidate.evidence > STRONG and len(candidate.amplitudes) <= FREE
-            if ask_odds and strong and not proof.proven:
+            if ask_odds and strong and proof.share > 0.0 and not proof.proven:
                 after = replace(candidate.adjustment, scene=shown.scene)
                 proof = replace(proof, odds=split.odds(current, after))
             if proof.proven and _is_determined(candidate, shown):

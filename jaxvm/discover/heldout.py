@@ -62,13 +62,14 @@ class Gain:
 
     @property
     def proven(self) -> bool:
-        """Whether the held-out epochs agree that it improves: by their errors, or by their odds.
+        """Whether the held-out epochs agree that it improves.
 
-        The significance of a finding is tested on the fitted epochs; the held-out ones are fewer
-        and only have to confirm it. A demand of 97.5 % here would lose every second effect that
-        the test has rightly found near its limit.
+        Their errors must be smaller, and either clearly so or with odds for it. The significance
+        of a finding is tested on the fitted epochs; the held-out ones are fewer and only have to
+        confirm it. A demand of 97.5 % here would lose every second effect that the test has rightly
+        found near its limit.
         """
-        return self.probability >= CONFIRMED or self.odds > 0.0
+        return self.share > 0.0 and (self.probability >= CONFIRMED or self.odds > 0.0)
 
 
 @dataclass(frozen=True)
