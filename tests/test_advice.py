@@ -183,6 +183,14 @@ def test_a_larger_effect_and_less_noise_decide_more(stereo):
         assert one.odds == pytest.approx(np.exp(min(one.gaps[0] / 2.0, 60.0)))
 
 
+def test_after_three_sure_plans_no_costlier_one_is_weighed(stereo):
+    plans = (PLAN["nearer"], PLAN["farther"])
+    quiet = advise(stereo, ones(stereo), 0, as_rivals(SHIFT), 1e-9, 4 * plans)
+    assert [a.plan.key for a in quiet] == ["nearer", "farther", "nearer"]
+    assert all(a.chance > 0.99 for a in quiet)
+    assert len(advise(stereo, ones(stereo), 0, as_rivals(SHIFT), 1e9, 4 * plans)) == 8
+
+
 def test_rivals_beside_each_other_are_weighed_alone(stereo):
     """More at once than the room holds, in any order: each has the gap that it has by itself."""
     turn = rival("mount.turn_x", "body_degC", "linear", 20.0)
@@ -445,5 +453,6 @@ def test_a_plan_needs_what_it_changes(stereo, frontal):
         if plan.poses is not None:
             assert possible(plan, recording) and not possible(plan, held)
     assert not possible(PLAN["longer"], replace(recording, timed=False))
-    keys = {a.plan.key for a in advise(stereo, ones(stereo), 0, as_rivals(SHIFT), 1.0)}
+    # In so much noise no plan is sure, and all that are possible are weighed.
+    keys = {a.plan.key for a in advise(stereo, ones(stereo), 0, as_rivals(SHIFT), 1e9)}
     assert keys == set(could)

@@ -40,6 +40,9 @@ from jaxvm.solve.problem import normal_at, scene_problem
 PROMISED = 0.95
 """Chance of coming apart from which on a plan is said to decide."""
 
+_ENOUGH = 3
+"""Plans that are as good as sure to decide, after which no costlier one is weighed."""
+
 _SURE = 0.99
 """Chance from which on plans are as good as each other, and the cheaper one comes first."""
 
@@ -88,7 +91,8 @@ def advise(
 ) -> list[Advice]:
     """Plans by what they bring for telling a finding from its rivals, best first.
 
-    Plans that are as good as sure to decide keep the order of their cost.
+    Plans that are as good as sure to decide keep the order of their cost; after three of them the
+    costlier ones are not weighed.
 
     Args:
         scene: the last model, fitted.
@@ -133,6 +137,8 @@ def advise(
         chances = _chances(even, gain, decisive_gap(drop))
         own = tuple(rivals[k].hypothesis for k in kept)
         advices.append(Advice(plan, own, tuple(expected.tolist()), tuple(chances.tolist())))
+        if sum(advice.chance >= _SURE for advice in advices) == _ENOUGH:
+            break
     return sorted(advices, key=lambda advice: -min(advice.chance, _SURE))
 
 
