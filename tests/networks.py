@@ -1,7 +1,8 @@
 """Small networks with a known truth, for tests of the residual and of the solvers.
 
-Pixels come from OpenCV, distances and relative poses from matrices: nothing here is predicted by
-jaxvm. Every recording carries the truth as its start values; `without_starts` takes them away.
+Pixels come from OpenCV, distances and relative poses from matrices: nothing in these recordings is
+predicted by jaxvm. (Effects are added on top of them: `predicted`.) Every recording carries the
+truth as its start values; `without_starts` takes them away.
 """
 
 from dataclasses import dataclass, replace
@@ -13,6 +14,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from jaxvm.geometry.targets import grid_points
+from jaxvm.network.residual import predict_pixels
 from jaxvm.network.scene import Scene, build
 from jaxvm.network.state import State
 from jaxvm.recording.model import (
@@ -58,6 +60,14 @@ def at_values(scene: Scene, values: dict[str, np.ndarray]) -> Scene:
         assert state[name].shape == np.shape(value), name
         state[name] = np.asarray(value, float)
     return scene.with_state(State(**{name: np.asarray(v) for name, v in state.items()}))
+
+
+def predicted(scene: Scene) -> np.ndarray:
+    """The pixels [observations, 2] that a scene predicts, in the order of its recording."""
+    pixel = np.zeros(scene.recording.observations.pixel.shape)
+    for rows, own in zip(scene.tables, predict_pixels(scene.state, scene.network), strict=True):
+        pixel[rows] = np.asarray(own)[: len(rows)]
+    return pixel
 
 
 def matrix(pose) -> np.ndarray:

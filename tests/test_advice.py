@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from networks import HELD, IMAGE, at_values, stereo_recording
+from networks import HELD, IMAGE, at_values, predicted, stereo_recording
 from scipy.spatial.transform import Rotation
 
 from jaxvm.discover.advice import _batches, _chances, _information, advise
@@ -18,7 +18,6 @@ from jaxvm.discover.plans import PLANS, Plan, planned, possible
 from jaxvm.discover.rivals import Rival
 from jaxvm.discover.select import DECIDED
 from jaxvm.geometry.targets import grid_points
-from jaxvm.network.residual import predict_pixels
 from jaxvm.network.scene import Scene, build
 from jaxvm.physics.catalogue.entry import each
 from jaxvm.physics.effects import Scope, Term
@@ -48,14 +47,6 @@ def rival(port: str, driver: str, form: str, reference: float = 0.0) -> Hypothes
 
 def as_rivals(*hypotheses: Hypothesis) -> tuple[Rival, ...]:
     return tuple(Rival(hypothesis, 0.0, 1.0) for hypothesis in hypotheses)
-
-
-def predicted(scene: Scene) -> np.ndarray:
-    """Pixels in the order of the recording."""
-    pixel = np.zeros(scene.recording.observations.pixel.shape)
-    for rows, own in zip(scene.tables, predict_pixels(scene.state, scene.network), strict=True):
-        pixel[rows] = np.asarray(own)[: len(rows)]
-    return pixel
 
 
 def with_pixels(scene: Scene, used: np.ndarray | None = None) -> Recording:

@@ -29,6 +29,7 @@ from jaxvm.physics.drivers import (
     build_channels,
     channel_kind,
     pattern,
+    patterns,
 )
 from jaxvm.physics.effects import Effect, Scope, Term
 from jaxvm.physics.forms import BASES, FORMS
@@ -458,3 +459,16 @@ def test_words_of_a_substance(entry, driver, value, std, words):
     effect = Effect(named.physics, named.groups[-1], driver, "linear", catalogue_id=entry)
     said = substance(effect, parameters(replace(effect, amplitudes=(value,)), (std,)))
     assert said.startswith(words) and bool(said) == bool(words)
+
+
+def test_light_that_enters_a_foil_has_the_pattern_of_its_entry():
+    """Snell: the way within goes with 1 / sqrt(1 - (sin i / n)^2) at the angle of incidence i."""
+    (terms,) = BY_ID["range-penetration"].groups
+    incidence = np.linspace(0.0, np.radians(60.0), 50)
+    drivers = np.zeros((50, len(OBSERVATION_DRIVERS)))
+    drivers[:, list(OBSERVATION_DRIVERS).index("incidence")] = incidence
+    columns = np.hstack([patterns((term,), drivers) for term in terms])
+    for index in (1.33, 1.5, 1.7):
+        within = 1.0 / np.sqrt(1.0 - (np.sin(incidence) / index) ** 2)
+        left = within - columns @ np.linalg.lstsq(columns, within, rcond=None)[0]
+        assert np.abs(left).max() < 0.05 * np.ptp(within)

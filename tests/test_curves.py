@@ -6,11 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from networks import HELD, IMAGE
+from networks import HELD, IMAGE, predicted
 
 from jaxvm.discover.curves import curve_constants, curved_drivers
 from jaxvm.geometry.targets import grid_points
-from jaxvm.network.residual import predict_pixels
 from jaxvm.network.scene import build
 from jaxvm.physics.catalogue.maps import (
     fine_image_map,
@@ -141,9 +140,7 @@ def turning():
     )
     recording = Recording(model, np.arange(N_EPOCHS), time, {}, seen)
     scene = build(recording)
-    pixel = np.zeros((len(epoch), 2))
-    for rows, own in zip(scene.tables, predict_pixels(scene.state, scene.network), strict=True):
-        pixel[rows] = np.asarray(own)[: len(rows)]
+    pixel = predicted(scene)
     share = time / time[-1]
     chirp = 1e-4 * np.sin(2.0 * np.pi * (0.6 * share + 1.6 * share**2)) * (0.5 + share)
     # A small turn about y moves marks by -f (1 + x^2) along u, and by -f x y along v.

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from networks import board_recording
+from networks import board_recording, predicted
 
 from jaxvm.discover import courses
 from jaxvm.discover.constants import constants_held, other_instants, run_away
@@ -15,7 +15,6 @@ from jaxvm.discover.heldout import evaluate, split
 from jaxvm.discover.score import ScoreTests
 from jaxvm.discover.select import shortlist
 from jaxvm.discover.space import enumerate_hypotheses
-from jaxvm.network.residual import predict_pixels
 from jaxvm.physics.effects import Effect, Scope, Term
 from jaxvm.recording.recording import Drivers
 from jaxvm.solve.adjust import adjust
@@ -41,9 +40,7 @@ def recorded():
     instant = float(middles[47])  # between epochs 49 and 50: two gaps are left out at the start
     truth = plain.with_effects((slipped(instant),), (8, 4))
     obs = known.recording.observations
-    pixel = np.zeros(obs.pixel.shape)
-    for rows, own in zip(truth.tables, predict_pixels(truth.state, truth.network), strict=True):
-        pixel[rows] = np.asarray(own)[: len(rows)]
+    pixel = predicted(truth)
     pixel += obs.sigma[:, None] * np.random.default_rng(5).standard_normal(pixel.shape)
     recording = replace(known.recording, observations=replace(obs, pixel=pixel))
     return known.true_scene(recording), instant
@@ -162,9 +159,7 @@ def with_hidden(form, constants, terms, amplitudes, scope):
     truth = plain.with_effects((own,), (8, 4))
     obs = known.recording.observations
     obs = replace(obs, sigma=0.1 * obs.sigma)
-    pixel = np.zeros(obs.pixel.shape)
-    for rows, own in zip(truth.tables, predict_pixels(truth.state, truth.network), strict=True):
-        pixel[rows] = np.asarray(own)[: len(rows)]
+    pixel = predicted(truth)
     pixel += obs.sigma[:, None] * np.random.default_rng(5).standard_normal(pixel.shape)
     observations = replace(obs, pixel=pixel)
     return known.true_scene(replace(plain.recording, observations=observations))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from networks import stereo_recording
+from networks import predicted, stereo_recording
 from scipy.signal import lfilter, lsim
 
 from jaxvm.cli import main
@@ -31,7 +31,7 @@ from jaxvm.identify.trajectories import (
 )
 from jaxvm.montecarlo import run
 from jaxvm.montecarlo.drift import compensation_study
-from jaxvm.network.residual import predict_pixels, residual
+from jaxvm.network.residual import residual
 from jaxvm.network.scene import build
 from jaxvm.physics.drivers import POWER_ON
 from jaxvm.physics.effects import Effect, Scope, Term
@@ -214,9 +214,7 @@ def a_recording(effects=(), seed: int = 1, hours: float = 10.0, noise: int = 0) 
     recording = Recording(model, np.arange(len(time)), time, {}, empty,
                           Drivers(log, {"ambient_degC": weather(log, seed)}))  # fmt: skip
     scene = build(recording, tuple(effects))
-    pixel = np.zeros((len(epoch), 2))
-    for rows, own in zip(scene.tables, predict_pixels(scene.state, scene.network), strict=True):
-        pixel[rows] = np.asarray(own)[: len(rows)]
+    pixel = predicted(scene)
     pixel += sigma * np.random.default_rng([seed, noise]).normal(size=pixel.shape)
     return replace(recording, observations=replace(empty, pixel=pixel))
 

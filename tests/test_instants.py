@@ -4,13 +4,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from networks import board_recording
+from networks import board_recording, predicted
 
 from jaxvm.discover.courses import Course, gaps
 from jaxvm.discover.groups import Group
 from jaxvm.discover.hypotheses import Hypothesis
 from jaxvm.discover.instants import at_best_instants, instants_of, with_spread
-from jaxvm.network.residual import predict_pixels
 from jaxvm.physics.effects import Effect, Scope, Term
 from jaxvm.report.words import when
 from jaxvm.solve.adjust import adjust
@@ -41,9 +40,7 @@ def fitted(board, truth, start, seed=0, unseen=()):
     known, recording = board
     obs, rng = recording.observations, np.random.default_rng(seed)
     exact = known.true_scene(recording).with_effects((truth,), (8, 4))
-    pixel = np.zeros(obs.pixel.shape)
-    for rows, own in zip(exact.tables, predict_pixels(exact.state, exact.network), strict=True):
-        pixel[rows] = np.asarray(own)[: len(rows)]
+    pixel = predicted(exact)
     pixel += obs.sigma[:, None] * rng.standard_normal(pixel.shape)
     drawn = replace(recording, observations=replace(obs, pixel=pixel))
     scene = known.true_scene(drawn).with_effects((start,), (8, 4))

@@ -4,11 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from networks import board_recording
+from networks import board_recording, predicted
 
 from jaxvm.discover.first_states import first_states, with_first_states
 from jaxvm.discover.inputs import sample_error, variances_by_inputs
-from jaxvm.network.residual import predict_pixels
 from jaxvm.physics.effects import Effect, Scope, Term
 from jaxvm.recording import Drivers
 from jaxvm.solve.adjust import adjust
@@ -41,9 +40,7 @@ def recorded(seed: int, state: float, log_error: float = 0.0):
     )
     truth = known.true_scene(recording).with_effects((bent,), (8, 4))
     obs = recording.observations
-    pixel = np.zeros(obs.pixel.shape)
-    for rows, own in zip(truth.tables, predict_pixels(truth.state, truth.network), strict=True):
-        pixel[rows] = np.asarray(own)[: len(rows)]
+    pixel = predicted(truth)
     pixel += obs.sigma[:, None] * np.random.default_rng(seed).standard_normal(pixel.shape)
     read = air + log_error * np.random.default_rng([seed, 1]).standard_normal(len(air))
     recording = replace(

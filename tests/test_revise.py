@@ -4,13 +4,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from networks import board_recording
+from networks import board_recording, predicted
 
 from jaxvm.discover.courses import Course
+from jaxvm.discover.diagnose import _plain_fit
 from jaxvm.discover.groups import Group
 from jaxvm.discover.hypotheses import Hypothesis
-from jaxvm.discover.revise import followed, follows, prune
-from jaxvm.network.residual import predict_pixels
+from jaxvm.discover.revise import followed, follows, likelier, prune
+from jaxvm.discover.rivals import Rival
+from jaxvm.discover.search import Search
 from jaxvm.physics.catalogue.entry import each
 from jaxvm.physics.effects import Effect, Scope, Term
 from jaxvm.solve.adjust import adjust
@@ -22,11 +24,17 @@ AMOUNTS = each("epoch", "sensor.focal", numbers=range(N_EPOCHS))
 
 @dataclass(frozen=True)
 class Told:
-    """Of a finding, what `prune` needs."""
+    """Of a finding, what is asked here."""
 
     hypothesis: Hypothesis
     effect: Effect
     drop: float = 1e3
+    final_effect: Effect | None = None
+    stds: tuple[float, ...] = ()
+    weight: float = 1.0
+    others: tuple = ()
+    rivals: tuple[Rival, ...] = ()
+    alternatives: tuple[Hypothesis, ...] = ()
 
 
 def told(effect):
@@ -57,9 +65,7 @@ def pruned(known, jump, hunting, seed=3, idle=()):
     room = (N_EPOCHS + 8, 4)
     truth = known.true_scene(recording).with_effects((step, *idle, hunts), room)
     obs = recording.observations
-    pixel = np.zeros(obs.pixel.shape)
-    for rows, own in zip(truth.tables, predict_pixels(truth.state, truth.network), strict=True):
-        pixel[rows] = np.asarray(own)[: len(rows)]
+    pixel = predicted(truth)
     pixel += obs.sigma[:, None] * rng.standard_normal(pixel.shape)
     drawn = replace(recording, observations=replace(obs, pixel=pixel))
     scene = known.true_scene(drawn).with_effects((step, *idle, hunts), room)
@@ -96,3 +102,49 @@ def test_amounts_follow_what_acts_at_their_ports_and_place():
     assert not follows(step, hunts)
     findings = [told(step), told(hunts), told(shift)]
     assert [followed(findings, k) for k in range(3)] == [True, False, False]
+
+
+# --- what has no name ---------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def drifting(known):
+    """A search that has found a drift of the focal length, and not its name."""
+    size = 5e-3 / float(np.ptp(known.recording.time))
+    drift = Effect("drift", (Term("sensor.focal"),), "time", "linear", (), 0.0, CAMERA, (size,))
+    room = (16, 8)
+    truth = known.true_scene().with_effects((drift,), room)
+    obs = known.recording.observations
+    noise = obs.sigma[:, None] * np.random.default_rng(4).standard_normal(obs.pixel.shape)
+    recording = replace(known.recording, observations=replace(obs, pixel=predicted(truth) + noise))
+    parts, plain, _ = _plain_fit(known.true_scene(recording).with_effects((), room), 3)
+    plain, heldout = parts.proven(plain)
+    search = Search(parts, plain, heldout, 0)
+    search.current = parts.fit(plain.scene.with_effects((drift,), room))
+    search.findings = [told(drift)]
+    return search
+
+
+def test_names_at_its_place_are_tried_for_what_has_none(drifting):
+    before = drifting.findings[0]
+    tried = drifting._with_names_to_try(0).alternatives
+    assert 0 < len(tried) <= 3
+    assert all(h.entries and h.scope == before.hypothesis.scope for h in tried)
+    # What settles slowly after power-on is nearly a straight line.
+    assert "focal-warm-up" in {entry.id for h in tried for entry in h.entries}
+    named = replace(before, hypothesis=tried[0])
+    drifting.findings = [named]
+    assert drifting._with_names_to_try(0) is named
+    drifting.findings = [before]
+
+
+@pytest.mark.parametrize("weight, leads", [(0.9, False), (1.1, True)])
+def test_a_name_leads_as_soon_as_it_is_as_likely(drifting, weight, leads):
+    (unnamed,) = drifting.findings
+    named = drifting._with_names_to_try(0).alternatives[0]
+    findings = [replace(unnamed, rivals=(Rival(named, 0.0, weight),))]
+    _, found = likelier(drifting.current, findings, 0, drifting.parts.fit)
+    assert bool(found[0].hypothesis.entries) == leads
+    # Of two names one must be clearly likelier.
+    among = [replace(findings[0], hypothesis=named)]
+    assert likelier(drifting.current, among, 0, drifting.parts.fit)[1] is among

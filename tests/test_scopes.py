@@ -4,11 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from networks import stereo_recording
+from networks import predicted, stereo_recording
 
 from jaxvm.discover.heldout import Split, range_weights_of, weights_of
 from jaxvm.discover.scopes import merged, sharing
-from jaxvm.network.residual import predict_pixels
 from jaxvm.physics.effects import Effect, Scope, Term
 
 ROOM = (16, 4)
@@ -39,9 +38,7 @@ def fitted_to(known, true: tuple[Effect, ...], fitted: Effect, seed: int = 5):
     """The fit of one effect to pixels that the true ones make, and what was fitted."""
     scene = known.true_scene().with_effects(true, ROOM)
     obs = known.recording.observations
-    pixel = np.zeros(obs.pixel.shape)
-    for rows, own in zip(scene.tables, predict_pixels(scene.state, scene.network), strict=True):
-        pixel[rows] = np.asarray(own)[: len(rows)]
+    pixel = predicted(scene)
     pixel += obs.sigma[:, None] * np.random.default_rng(seed).standard_normal(pixel.shape)
     recording = replace(known.recording, observations=replace(obs, pixel=pixel))
     start = known.true_scene(recording).with_effects((fitted,), ROOM)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from networks import board_recording
+from networks import board_recording, predicted
 
 from jaxvm.discover.accept import STRONG
 from jaxvm.discover.constants import sensible
@@ -13,7 +13,6 @@ from jaxvm.discover.diagnose import _plain_fit
 from jaxvm.discover.groups import Group
 from jaxvm.discover.hypotheses import Hypothesis
 from jaxvm.discover.select import best_named, evidence, identity, log_prior, refit
-from jaxvm.network.residual import predict_pixels
 from jaxvm.physics.catalogue import entries_for
 from jaxvm.physics.catalogue.entry import each
 from jaxvm.physics.effects import Effect, Scope, Term
@@ -41,6 +40,27 @@ def test_the_size_decides_between_two_names(per_kelvin, name):
     priors = [log_prior(own, np.array([per_kelvin])) for own in alone]
     assert priors[0] > priors[1]
     assert len({identity(own) for own in alone}) == 2
+
+
+def test_shifts_in_pixels_are_no_part_of_the_size_of_a_lens():
+    terms = (*FOCAL, Term("sensor.cx"), Term("sensor.cy"))
+    names = entries_for(terms, "camera", ("quantity", "temperature"), "rate")
+    assert [entry.id for entry in names] == ["window-heats"]
+    course = Course("body_degC", "rate")
+    heats = Hypothesis(Group(terms, "camera"), course, Scope(camera=("left",)), names)
+    plausible = [log_prior(heats, np.array([2e-4, *px])) for px in ((0.0, 0.0), (0.04, 0.1))]
+    assert plausible[0] == plausible[1]
+    assert log_prior(heats, np.array([5e-3, 0.0, 0.0])) < plausible[0] - 2.0
+
+
+@pytest.mark.parametrize("late, name", [(1.3e-3, "trigger-late"), (0.4, "frame-slip")])
+def test_no_camera_loses_a_thousandth_of_a_second(late, name):
+    terms = (Term("clock.offset"),)
+    names = entries_for(terms, "camera", ("time",), "step")
+    assert {entry.id for entry in names} == {"trigger-late", "frame-slip"}
+    step = Course("time", "step", (10.0,))
+    delay = Hypothesis(Group(terms, "camera"), step, Scope(camera=("left",)), names)
+    assert best_named(delay, np.array([late])).entries[0].id == name
 
 
 def test_amounts_of_epochs_that_are_set_aside_cost_nothing():
@@ -116,9 +136,7 @@ def test_depths_of_marks_do_not_run_away_with_the_poses():
     depths = Hypothesis(Group(terms, "target"), Course("constant", "constant"), scope, names)
     true = 3e-4 * np.random.default_rng(4).standard_normal(30)
     scene = known.true_scene().with_effects((depths.effect(true),), (40, 4))
-    pixel = np.zeros(obs.pixel.shape)
-    for rows, own in zip(scene.tables, predict_pixels(scene.state, scene.network), strict=True):
-        pixel[rows] = np.asarray(own)[: len(rows)]
+    pixel = predicted(scene)
     pixel += obs.sigma[:, None] * np.random.default_rng(5).standard_normal(pixel.shape)
     recording = replace(known.recording, observations=replace(obs, pixel=pixel))
     parts, plain, _ = _plain_fit(known.true_scene(recording), 3)

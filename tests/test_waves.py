@@ -5,13 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from networks import predicted
 
 from jaxvm.discover import diagnose
 from jaxvm.discover.heldout import hold_out, split
 from jaxvm.discover.scatter import ALIKE, likeness
 from jaxvm.discover.waves import strongest_wave
 from jaxvm.geometry.targets import grid_points
-from jaxvm.network.residual import predict_pixels
 from jaxvm.network.scene import build
 from jaxvm.physics.catalogue.entry import each
 from jaxvm.physics.effects import Effect, Scope
@@ -45,9 +45,7 @@ def still():
     )
     recording = Recording(model, np.arange(N_EPOCHS), SPACING * np.arange(N_EPOCHS), {}, seen)
     scene = build(recording)
-    pixel = np.zeros((len(epoch), 2))
-    for rows, own in zip(scene.tables, predict_pixels(scene.state, scene.network), strict=True):
-        pixel[rows] = np.asarray(own)[: len(rows)]
+    pixel = predicted(scene)
     return replace(recording, observations=replace(seen, pixel=pixel))
 
 
@@ -151,9 +149,7 @@ def pair(still):
     model = replace(still.model, cameras=(camera, beside))
     recording = replace(still, model=model, observations=both)
     scene = build(recording)
-    pixel = np.zeros((len(both.epoch), 2))
-    for rows, own in zip(scene.tables, predict_pixels(scene.state, scene.network), strict=True):
-        pixel[rows] = np.asarray(own)[: len(rows)]
+    pixel = predicted(scene)
     return replace(recording, observations=replace(both, pixel=pixel))
 
 

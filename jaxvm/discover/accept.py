@@ -1,6 +1,7 @@
 """Accept a hypothesis: refit the leading ones; the best that improves held-out epochs wins."""
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -72,6 +73,7 @@ def accept(
             that is the same in all epochs: where what differs from image to image is still to be
             found, whatever happens to follow it has odds for it.
     """
+    in_all = cache(lambda: split.undivided(current.scene).fit(current.scene))
     # One tangent foretells a drop to a few percent: only near ties of the leading one need a refit.
     # Where none of them passes, named physics gets its turn; an unnamed effect must lead.
     least = leading[0][1] - max(_NEAR, _TIE * abs(leading[0][1]))
@@ -99,7 +101,7 @@ def accept(
             strong = candidate.evidence > STRONG and len(candidate.amplitudes) <= FREE
             if ask_odds and strong and proof.share > 0.0 and not proof.proven:
                 after = replace(candidate.adjustment, scene=shown.scene)
-                proof = replace(proof, odds=split.odds(current, after))
+                proof = replace(proof, odds=split.odds(current, in_all(), after))
             if proof.proven and _is_determined(candidate, shown):
                 gap = max(_OPEN[0], _OPEN[1] * abs(candidate.evidence))
                 others = tuple(

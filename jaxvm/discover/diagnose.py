@@ -83,7 +83,7 @@ def diagnose(
     current, findings = found.current, found.findings
 
     progress("final fit to all epochs")
-    everything = split(scene, np.zeros(len(parts.held), bool), parts.sound)
+    everything = parts.undivided(scene)
     final = everything.fit(current.scene)
     final, instants = at_best_instants(final, findings, len(effects), parts.sound)
     final = _with_first_states(final, parts.sound)

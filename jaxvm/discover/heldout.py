@@ -132,7 +132,11 @@ class Split:
         heldout = self.evaluate(fitted.scene)
         return replace(fitted, scene=heldout.scene), heldout
 
-    def odds(self, before: Adjustment, after: Adjustment) -> float:
+    def undivided(self, scene: Scene) -> "Split":
+        """The same with nothing set aside."""
+        return split(scene, np.zeros(len(self.held), bool), self.sound)
+
+    def odds(self, before: Adjustment, in_all: Adjustment, after: Adjustment) -> float:
         """Twice the log of the odds that the held-out epochs give to what a fit has more.
 
         That is 2 ln p(held | fitted, after) - 2 ln p(held | fitted, before), the density of each
@@ -145,18 +149,14 @@ class Split:
         Args:
             before, after: fits to the fitted epochs; the effects of `after` are those of `before`
                 and more.
+            in_all: the model of `before` fitted to all epochs.
         """
-        everything = split(before.scene, np.zeros(len(self.held), bool), self.sound)
-        drops = [
-            2.0 * (one.cost - other.cost) / after.variance_factor
-            for one, other in (
-                (before, after),
-                (everything.fit(before.scene), everything.fit(after.scene)),
-            )
-        ]
-        new = [e.n_columns + len(e.constants) for e in after.scene.effects]
-        new = sum(new[len(before.scene.effects) :])
-        return float(drops[1] - drops[0] - new * np.log(everything.n / self.n))
+        everything = self.undivided(after.scene)
+        gained = in_all.cost - everything.fit(after.scene).cost - (before.cost - after.cost)
+        own = after.scene.effects[len(before.scene.effects) :]
+        new = sum(effect.n_columns + len(effect.constants) for effect in own)
+        sharper = new * np.log(everything.n / self.n)
+        return float(2.0 * gained / after.variance_factor - sharper)
 
     def residuals(self, fitted: Adjustment) -> np.ndarray:
         """Whitened residuals [observations, 2] of the fitted epochs; NaN where not fitted."""

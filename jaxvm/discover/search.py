@@ -344,6 +344,7 @@ class Search:
             self.findings = self._confirmed()
         names = [finding.hypothesis for finding in self.findings]
         if len(names) > 1:
+            self.findings = [self._with_names_to_try(k) for k in range(len(self.findings))]
             self._rename()
             self.findings = [self._weighed_again(k) for k in range(len(self.findings))]
             if any(r.weight > f.weight for f in self.findings for r in f.rivals):
@@ -373,7 +374,6 @@ class Search:
 
     def _rename(self) -> None:
         """Better names beside all the others."""
-        self.findings = [self._with_names_to_try(k) for k in range(len(self.findings))]
         self._take_over(*rename(self.current, self.findings, self.parts.n, self.parts.fit))
 
     def _with_names_to_try(self, k: int) -> Finding:

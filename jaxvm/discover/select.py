@@ -103,7 +103,9 @@ def _log_size(entry: Entry, hypothesis: Hypothesis, amplitudes: np.ndarray) -> f
     """
     units = [PORTS[PORT_INDEX[term.port]].unit for term in hypothesis.group.terms]
     first = amplitudes[:: len(FORMS[hypothesis.course.form].bases)]
-    size = float(np.linalg.norm([a for a, u in zip(first, units, strict=False) if u == units[0]]))
+    # Of a rival that was not fitted no amplitudes are known.
+    known = zip(first, units, strict=False)
+    size = float(np.linalg.norm([a for a, unit in known if unit == units[0]]))
     if size == 0.0:
         return 0.0
     low, high = entry.plausible

@@ -228,7 +228,7 @@ def proof(gain: Gain) -> str:
     """What the held-out epochs say: their errors and, where these don't tell, their odds."""
     low, high = (100.0 * bound for bound in gain.interval)
     words = (
-        f"{gain.before_px:.4f} px -> {gain.after_px:.4f} px "
+        f"held-out {gain.before_px:.4f} px -> {gain.after_px:.4f} px "
         f"({low:.1f} to {high:.1f} % of chi-square, 95 %)"
     )
     if gain.odds > 0.0:
@@ -266,10 +266,7 @@ def signal_rows(diagnosis: Diagnosis) -> list[tuple[str, str]]:
             f"around foretell; p = {signal.p_value:.2g}; correlation with the next "
             f"image {signal.lasting:.2f}",
         ),
-        (
-            "proof",
-            f"held-out {proof(gain)}",
-        ),
+        ("proof", proof(gain)),
         ("separate", HAZE.separate_by),
     ]
 
@@ -354,7 +351,7 @@ def summary(diagnosis: Diagnosis) -> str:
             f"   explains  {100 * finding.share:.0f} % of the excess chi-square, "
             f"{in_pixels(finding):.3f} px RMS; p = {finding.p_value:.2g}, family-wise, "
             f"of {finding.n_hypotheses:,} hypotheses",
-            f"   proof     held-out {proof(gain)}",
+            f"   proof     {proof(gain)}",
         ]
         if finding.rivals:
             alike = "; ".join(doubles(finding))
