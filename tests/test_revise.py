@@ -10,9 +10,11 @@ from jaxvm.discover.courses import Course
 from jaxvm.discover.diagnose import _plain_fit
 from jaxvm.discover.groups import Group
 from jaxvm.discover.hypotheses import Hypothesis
+from jaxvm.discover.naming import Naming
 from jaxvm.discover.revise import followed, follows, likelier, prune
 from jaxvm.discover.rivals import Rival
-from jaxvm.discover.search import Search
+from jaxvm.discover.score import ScoreTests
+from jaxvm.discover.space import enumerate_hypotheses
 from jaxvm.physics.catalogue.entry import each
 from jaxvm.physics.effects import Effect, Scope, Term
 from jaxvm.solve.adjust import adjust
@@ -109,7 +111,7 @@ def test_amounts_follow_what_acts_at_their_ports_and_place():
 
 @pytest.fixture(scope="module")
 def drifting(known):
-    """A search that has found a drift of the focal length, and not its name."""
+    """What judges names, a fit with a drift of the focal length, and the finding without a name."""
     size = 5e-3 / float(np.ptp(known.recording.time))
     drift = Effect("drift", (Term("sensor.focal"),), "time", "linear", (), 0.0, CAMERA, (size,))
     room = (16, 8)
@@ -119,32 +121,28 @@ def drifting(known):
     recording = replace(known.recording, observations=replace(obs, pixel=predicted(truth) + noise))
     parts, plain, _ = _plain_fit(known.true_scene(recording).with_effects((), room), 3)
     plain, heldout = parts.proven(plain)
-    search = Search(parts, plain, heldout, 0)
-    search.current = parts.fit(plain.scene.with_effects((drift,), room))
-    search.findings = [told(drift)]
-    return search
+    naming = Naming(ScoreTests.of(plain, enumerate_hypotheses(plain.scene)), parts, heldout)
+    return naming, parts.fit(plain.scene.with_effects((drift,), room)), told(drift)
 
 
 def test_names_at_its_place_are_tried_for_what_has_none(drifting):
-    before = drifting.findings[0]
-    tried = drifting._with_names_to_try(0).alternatives
+    naming, fit, before = drifting
+    tried = naming.with_names_to_try(fit, [before], 0).alternatives
     assert 0 < len(tried) <= 3
     assert all(h.entries and h.scope == before.hypothesis.scope for h in tried)
     # What settles slowly after power-on is nearly a straight line.
     assert "focal-warm-up" in {entry.id for h in tried for entry in h.entries}
     named = replace(before, hypothesis=tried[0])
-    drifting.findings = [named]
-    assert drifting._with_names_to_try(0) is named
-    drifting.findings = [before]
+    assert naming.with_names_to_try(fit, [named], 0) is named
 
 
 @pytest.mark.parametrize("weight, leads", [(0.9, False), (1.1, True)])
 def test_a_name_leads_as_soon_as_it_is_as_likely(drifting, weight, leads):
-    (unnamed,) = drifting.findings
-    named = drifting._with_names_to_try(0).alternatives[0]
+    naming, fit, unnamed = drifting
+    named = naming.with_names_to_try(fit, [unnamed], 0).alternatives[0]
     findings = [replace(unnamed, rivals=(Rival(named, 0.0, weight),))]
-    _, found = likelier(drifting.current, findings, 0, drifting.parts.fit)
+    _, found = likelier(fit, findings, 0, naming.parts.fit)
     assert bool(found[0].hypothesis.entries) == leads
     # Of two names one must be clearly likelier.
     among = [replace(findings[0], hypothesis=named)]
-    assert likelier(drifting.current, among, 0, drifting.parts.fit)[1] is among
+    assert likelier(fit, among, 0, naming.parts.fit)[1] is among

@@ -11,11 +11,11 @@ from jaxvm.discover.diagnosis import Finding
 from jaxvm.discover.doubt import doubted
 from jaxvm.discover.finer import at_finer_constants, said, with_slow_beginnings
 from jaxvm.discover.heldout import HeldOut, Split, gain
-from jaxvm.discover.hypotheses import FREE
+from jaxvm.discover.naming import WORSE, Naming
 from jaxvm.discover.noise import Correlation, Met, met, random_signs
 from jaxvm.discover.pairs import better_pair, other_beginnings, worth_a_second_thought
 from jaxvm.discover.ranking import Ranking, spread_of_constant, surprise
-from jaxvm.discover.revise import followed, likelier, lost_without, prune, rename, with_effects
+from jaxvm.discover.revise import lost_without, prune, with_effects
 from jaxvm.discover.rivals import rivals
 from jaxvm.discover.scatter import ALIKE, likeness, of_each_image
 from jaxvm.discover.score import ScoreTests
@@ -30,17 +30,8 @@ from jaxvm.solve.snooping import robust_variance
 ALPHA = 0.01
 """Family-wise probability to claim something where nothing is hidden."""
 
-_WORSE = 1.01
-"""Rise of the held-out RMS that other names may bring: what differs less is noise."""
-
-_WIDER = 1.2
-"""Inflation by noise from which the rivals of a finding are weighed again: more of them stay."""
-
 _TURNS = 3
 """Findings that in turn only took the place of another, until they are as good as each other."""
-
-_LEADING, _NAMES = 60, 3
-"""Leading hypotheses among which names are looked for, and names tried for what has none."""
 
 FLIPS = 199
 """Repetitions of the null distribution."""
@@ -235,7 +226,7 @@ class Search:
 
     def _as_good_on_heldout(self, candidate: Candidate) -> bool:
         shown = self.parts.evaluate(candidate.adjustment.scene)
-        return shown.rms_px <= _WORSE * self.heldout.rms_px
+        return shown.rms_px <= WORSE * self.heldout.rms_px
 
     def _take_pair(self, pair, progress: Callable[[str], None]) -> None:
         """Take hypotheses that were fitted already, as if each had led, while they are significant.
@@ -343,20 +334,8 @@ class Search:
             self.current, self.heldout = parts.proven(self.current)
             self.findings = self._confirmed()
         names = [finding.hypothesis for finding in self.findings]
-        if len(names) > 1:
-            self.findings = [self._with_names_to_try(k) for k in range(len(self.findings))]
-            self._rename()
-            self.findings = [self._weighed_again(k) for k in range(len(self.findings))]
-            if any(r.weight > f.weight for f in self.findings for r in f.rivals):
-                self._rename()
-                again = [not f.rivals and not f.stds for f in self.findings]
-                self.findings = [
-                    self._weighed_again(k) if own else self.findings[k]
-                    for k, own in enumerate(again)
-                ]
-        elif any(finding.noise > _WIDER for finding in self.findings):
-            self.findings = [self._weighed_again(0)]
-        self._lead_with_the_likeliest()
+        naming = Naming(self._tests, parts, self.heldout)
+        self.current, self.findings = naming.last(self.current, self.findings)
         if [finding.hypothesis for finding in self.findings] != names:
             self.current, self.heldout = parts.proven(self.current)
             deviations = effect_deviations(self.current)[self.given :]
@@ -371,70 +350,6 @@ class Search:
             self.unproven = self.unproven if self.p_value <= self.alpha else ""
         significant = self.p_value <= self.alpha
         self.findings = doubted(self.findings, self.ranking, significant)
-
-    def _rename(self) -> None:
-        """Better names beside all the others."""
-        self._take_over(*rename(self.current, self.findings, self.parts.n, self.parts.fit))
-
-    def _with_names_to_try(self, k: int) -> Finding:
-        """A finding without a name, with the named ones that lead at its place beside the others.
-
-        While others were missing, a stranger's sensor and a play of its own may have led, and what
-        was not near then is near now.
-        """
-        finding, scene = self.findings[k], self.current.scene
-        if finding.hypothesis.entries or followed(self.findings, k):
-            return finding
-        without = self._without(k)
-        variance = robust_variance(without)
-        ranking = self._tests.at(without).score(variance)
-        foremost = shortlist(ranking, scene, variance, self.parts.n, _LEADING, FREE)
-        named = [h for h, *_ in foremost if h.entries and h.scope == finding.hypothesis.scope]
-        return replace(finding, alternatives=(*named[:_NAMES], *finding.alternatives))
-
-    def _without(self, k: int) -> Adjustment:
-        """The fit with all findings but one."""
-        effects, scene = self.current.scene.fitted_effects(), self.current.scene
-        others = (*effects[: self.given + k], *effects[self.given + k + 1 :])
-        return self.parts.fit(scene.with_effects(others, scene.room))
-
-    def _lead_with_the_likeliest(self) -> None:
-        """Doubles that are likelier than what fits best lead, if held-out epochs say no other."""
-        for k in range(len(self.findings)):
-            current, findings = likelier(self.current, self.findings, k, self.parts.fit)
-            if findings is not self.findings:
-                self._take_over(current, findings)
-
-    def _take_over(self, current: Adjustment, findings: list[Finding]) -> None:
-        """Other names, where held-out epochs don't speak against them."""
-        shown = self.parts.evaluate(current.scene)
-        if shown.rms_px <= _WORSE * self.heldout.rms_px:
-            self.current, self.findings = current, findings
-
-    def _weighed_again(self, k: int) -> Finding:
-        """A finding among its rivals with all the others in the model, and with those it had.
-
-        Beside amounts of every image that can follow it all names are alike: it keeps those it had.
-        """
-        finding, scene, parts = self.findings[k], self.current.scene, self.parts
-        if followed(self.findings, k):
-            return finding
-        without = self._without(k)
-        shown = [
-            (r.hypothesis, np.zeros(0), 2.0 * np.log(max(finding.weight, 1e-9) / r.weight))
-            for r in finding.rivals
-        ]
-        chief, doubles = rivals(
-            without,
-            self.current,
-            finding.hypothesis,
-            scene.fitted_effects()[self.given + k],
-            self._tests.at(without),
-            parts.n,
-            shown,
-            finding.noise,
-        )
-        return replace(finding, weight=chief.weight, others=chief.others, rivals=tuple(doubles))
 
     def _drop_unconfirmed(self) -> None:
         effects = self.current.scene.fitted_effects()

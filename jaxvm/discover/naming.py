@@ -1,0 +1,139 @@
+"""The last names of findings, when all of them are in the model.
+
+While others were missing, a finding was named for what it and they have in common. Now each is
+tried under other names beside all the others, is weighed against its rivals again, and is led by
+the likeliest of them, where held-out epochs don't speak against it.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from jaxvm.discover.diagnosis import Finding
+from jaxvm.discover.heldout import HeldOut, Split
+from jaxvm.discover.hypotheses import FREE
+from jaxvm.discover.revise import followed, likelier, rename
+from jaxvm.discover.rivals import rivals
+from jaxvm.discover.score import ScoreTests
+from jaxvm.discover.select import shortlist
+from jaxvm.solve.adjust import Adjustment
+from jaxvm.solve.snooping import robust_variance
+
+WORSE = 1.01
+"""Rise of the held-out RMS that other names may bring: what differs less is noise."""
+
+_WIDER = 1.2
+"""Inflation by noise from which the rivals of a finding are weighed again: more of them stay."""
+
+_LEADING, _NAMES = 60, 3
+"""Leading hypotheses among which names are looked for, and names tried for what has none."""
+
+Named = tuple[Adjustment, list[Finding]]
+"""A fit and the findings that are the last of its effects."""
+
+
+@dataclass(frozen=True)
+class Naming:
+    """What names are judged by.
+
+    Attributes:
+        tests: of all hypotheses, at any fit.
+        parts: what is fitted and what is held out.
+        heldout: errors that other names may not raise.
+    """
+
+    tests: ScoreTests
+    parts: Split
+    heldout: HeldOut
+
+    def last(self, current: Adjustment, findings: list[Finding]) -> Named:
+        """The fit and its findings with their last names, weights and rivals.
+
+        A finding whose name has changed has no standard deviations (`Finding.stds`) yet.
+        """
+        named = current, findings
+        if len(findings) > 1:
+            named = current, [self.with_names_to_try(*named, k) for k in range(len(findings))]
+            named = self._renamed(*named)
+            named = self._weighed(*named, [True] * len(named[1]))
+            if any(r.weight > f.weight for f in named[1] for r in f.rivals):
+                named = self._renamed(*named)
+                named = self._weighed(*named, [not f.rivals and not f.stds for f in named[1]])
+        elif any(finding.noise > _WIDER for finding in findings):
+            named = self._weighed(*named, [True])
+        # Doubles that are likelier than what fits best lead.
+        for k in range(len(named[1])):
+            named = self._unless_worse(named, likelier(*named, k, self.parts.fit))
+        return named
+
+    def with_names_to_try(self, current: Adjustment, findings: list[Finding], k: int) -> Finding:
+        """A finding without a name, with the named ones that lead at its place beside the others.
+
+        While others were missing, a stranger's sensor and a play of its own may have led, and what
+        was not near then is near now.
+        """
+        finding = findings[k]
+        if finding.hypothesis.entries or followed(findings, k):
+            return finding
+        without = self._without(current, findings, k)
+        variance = robust_variance(without)
+        ranking = self.tests.at(without).score(variance)
+        leading = shortlist(ranking, current.scene, variance, self.parts.n, _LEADING, FREE)
+        named = [h for h, *_ in leading if h.entries and h.scope == finding.hypothesis.scope]
+        return replace(finding, alternatives=(*named[:_NAMES], *finding.alternatives))
+
+    def _renamed(self, current: Adjustment, findings: list[Finding]) -> Named:
+        """Better names beside all the others."""
+        other = rename(current, findings, self.parts.n, self.parts.fit)
+        return self._unless_worse((current, findings), other)
+
+    def _unless_worse(self, named: Named, other: Named) -> Named:
+        """Other names, where held-out epochs don't speak against them."""
+        if other[1] is named[1]:
+            return named
+        shown = self.parts.evaluate(other[0].scene)
+        return other if shown.rms_px <= WORSE * self.heldout.rms_px else named
+
+    def _weighed(self, current: Adjustment, findings: list[Finding], which: list[bool]) -> Named:
+        """Findings of which some are weighed among their rivals once more."""
+        chosen = zip(findings, which, strict=True)
+        return current, [
+            self._weighed_again(current, findings, k) if own else finding
+            for k, (finding, own) in enumerate(chosen)
+        ]
+
+    def _weighed_again(self, current: Adjustment, findings: list[Finding], k: int) -> Finding:
+        """A finding among its rivals with all the others in the model, and with those it had.
+
+        Beside amounts of every image that can follow it all names are alike: it keeps those it had.
+        """
+        finding = findings[k]
+        if followed(findings, k):
+            return finding
+        without = self._without(current, findings, k)
+        shown = [
+            (r.hypothesis, np.zeros(0), 2.0 * np.log(max(finding.weight, 1e-9) / r.weight))
+            for r in finding.rivals
+        ]
+        chief, doubles = rivals(
+            without,
+            current,
+            finding.hypothesis,
+            current.scene.fitted_effects()[_given(current, findings) + k],
+            self.tests.at(without),
+            self.parts.n,
+            shown,
+            finding.noise,
+        )
+        return replace(finding, weight=chief.weight, others=chief.others, rivals=tuple(doubles))
+
+    def _without(self, current: Adjustment, findings: list[Finding], k: int) -> Adjustment:
+        """The fit with all findings but one."""
+        effects, place = current.scene.fitted_effects(), _given(current, findings) + k
+        others = (*effects[:place], *effects[place + 1 :])
+        return self.parts.fit(current.scene.with_effects(others, current.scene.room))
+
+
+def _given(current: Adjustment, findings: list[Finding]) -> int:
+    """Number of effects that the engineer's model has itself."""
+    return len(current.scene.effects) - len(findings)
