@@ -28,7 +28,6 @@ from jaxvm.physics.drivers import (
     PLANES,
     build_channels,
     channel_kind,
-    pattern,
     patterns,
 )
 from jaxvm.physics.effects import Effect, Scope, Term
@@ -345,7 +344,7 @@ def test_drivers_of_a_distance_by_hand():
 
     meaning = {"one", "range", "inverse_range", "incidence"}
     for driver, basis in ((d, b) for d in OBSERVATION_DRIVERS for b in ("linear", "cosine")):
-        values = pattern(Term("range.offset", driver, basis, (2.0,)), jnp.asarray(table))
+        values = patterns([Term("range.offset", driver, basis, (2.0,))], jnp.asarray(table))[:, 0]
         assert np.any(values != 0.0) == (driver in meaning), driver
 
 
@@ -382,14 +381,31 @@ def test_a_seam_parts_the_image():
         term = Term("detect.u", name, "step", (place,))
         assert any(term in group for group in BY_ID["sensor-stitched"].groups)
         table[:, OBSERVATION_DRIVER_INDEX[name]] = place + at
-        assert jax.jit(lambda t, term=term: pattern(term, t))(table).tolist() == [0, 0, 1, 1]
+        found = jax.jit(lambda t, term=term: patterns([term], t))(table)
+        assert found[:, 0].tolist() == [0, 0, 1, 1]
+
+
+@pytest.mark.parametrize("course", [("constant", "constant", ()), ("time", "periodic", (60.0,))])
+def test_terms_keep_their_columns_when_they_are_evaluated_together(course):
+    images = each("epoch", "sensor.cx", numbers=range(3))
+    between = Term("detect.u", "radius", "linear"), Term("detect.v", "row", "linear")
+    terms = images[0], between[0], images[1], between[1], images[2]
+
+    def columns(*terms):
+        effect = Effect("effect", terms, *course, scope=Scope(camera=("cam",)))
+        (factor,) = board_recording().true_scene().with_effects((effect,), (16, 4)).network.pixels
+        return np.asarray(factor.pattern)[:, : effect.n_columns]
+
+    alone = np.concatenate([columns(term) for term in terms], axis=1)
+    np.testing.assert_array_equal(columns(*terms), alone)
+    assert len(np.unique(alone, axis=1).T) == len(terms)
 
 
 def test_each_mark_has_its_own_column():
     table = np.zeros((3, len(OBSERVATION_DRIVERS)))
     table[:, OBSERVATION_DRIVER_INDEX["mark"]] = [4.0, 5.0, 6.0]
     terms = each("mark", "target.point_z", numbers=range(4, 7))
-    columns = [np.asarray(pattern(term, table)) * term.weight for term in terms]
+    columns = [np.asarray(patterns([term], table)[:, 0]) * term.weight for term in terms]
     np.testing.assert_allclose(columns, np.eye(3), atol=1e-15)
 
 

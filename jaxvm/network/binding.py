@@ -17,9 +17,8 @@ from jaxvm.network.residual import Network, parts_of
 from jaxvm.network.tables import Tables
 from jaxvm.physics.blocks import by_blocks, roomy
 from jaxvm.physics.chain import Aim, Sight
-from jaxvm.physics.drivers import all_observation_drivers, all_range_drivers, pattern
+from jaxvm.physics.drivers import all_observation_drivers, all_range_drivers, patterns
 from jaxvm.physics.effects import Effect, Scope, courses
-from jaxvm.physics.forms import FORMS
 from jaxvm.physics.ports import PORTS, PortValues
 
 if TYPE_CHECKING:
@@ -32,32 +31,40 @@ def bind(scene: Scene) -> Scene:
     n_columns = network.effects.n_columns
     pixels = []
     for factor, rows in zip(network.pixels, scene.tables, strict=True):
-        patterns = np.zeros((factor.slots.shape[0], n_columns))
+        table = np.zeros((factor.slots.shape[0], n_columns))
         if scene.effects:
             drivers = observation_driver_table(scene, factor, rows)
             inside = [in_scope(scene, effect.scope, rows) for effect in scene.effects]
-            _fill(patterns, scene.effects, drivers, inside)
-        pixels.append(eqx.tree_at(lambda f: f.pattern, factor, jnp.asarray(patterns)))
+            _fill(table, scene.effects, drivers, inside)
+        pixels.append(eqx.tree_at(lambda f: f.pattern, factor, jnp.asarray(table)))
     network = eqx.tree_at(lambda n: n.pixels, network, tuple(pixels))
     if network.ranges is not None:
-        patterns = np.zeros((len(network.ranges.view), n_columns))
+        table = np.zeros((len(network.ranges.view), n_columns))
         if scene.effects:
             drivers = range_driver_table(scene, network.ranges)
             inside = [ranges_in_scope(scene, effect.scope) for effect in scene.effects]
-            _fill(patterns, scene.effects, drivers, inside)
-        network = eqx.tree_at(lambda n: n.ranges.pattern, network, jnp.asarray(patterns))
+            _fill(table, scene.effects, drivers, inside)
+        network = eqx.tree_at(lambda n: n.ranges.pattern, network, jnp.asarray(table))
     return replace(scene, network=_with_amplitude_priors(scene, network))
 
 
-def _fill(patterns: np.ndarray, effects: tuple[Effect, ...], drivers, inside) -> None:
-    """Write the patterns of all terms and bases, one column each; `inside` are the real rows."""
-    column = 0
+def _fill(table: np.ndarray, effects: tuple[Effect, ...], drivers, inside) -> None:
+    """Write the patterns of all terms and bases, one column each; `inside` are the real rows.
+
+    Terms that differ in their constants alone (what every image or mark has for itself, the tiles
+    of a map) are evaluated together.
+    """
+    first = 0
     for effect, own in zip(effects, inside, strict=True):
-        n = len(FORMS[effect.form].bases)
-        for term in effect.terms:
-            values = np.asarray(pattern(term, drivers))[: len(own)] * own
-            patterns[: len(own), column : column + n] = values[:, None]
-            column += n
+        columns = np.arange(first, first + effect.n_columns).reshape(len(effect.terms), -1)
+        first += effect.n_columns
+        alike: dict[tuple, list[int]] = {}
+        for k, term in enumerate(effect.terms):
+            alike.setdefault((term.driver, term.basis), []).append(k)
+        for places in alike.values():
+            values = np.asarray(patterns([effect.terms[k] for k in places], drivers))
+            values = values[: len(own)] * own[:, None]
+            table[: len(own), columns[places]] = values[:, :, None]
 
 
 def _with_amplitude_priors(scene: Scene, network: Network) -> Network:

@@ -213,17 +213,13 @@ def driven_by(driver: str) -> set[str]:
     return set(PLANES[driver][:2]) if driver in PLANES else {driver}
 
 
-def pattern(
-    term: Term, drivers: Float[Array | np.ndarray, "observations drivers"]
-) -> Float[Array, " observations"]:
-    """Pattern of one term over a table of observations; 0 where its driver has no meaning (NaN)."""
-    return patterns((term,), drivers)[:, 0]
-
-
 def patterns(
     terms: Sequence[Term], drivers: Float[Array | np.ndarray, "observations drivers"]
 ) -> Float[Array, "observations terms"]:
-    """Patterns of terms with one driver and one basis, which differ in their constants."""
+    """Patterns of terms with one driver and one basis, which differ in their constants.
+
+    They are 0 where the driver has no meaning (NaN).
+    """
     driver, basis = terms[0].driver, terms[0].basis
     constants = np.array([(*term.constants, 1.0, 1.0)[:2] for term in terms], float)
     (table,) = hosted(drivers)
