@@ -120,7 +120,7 @@ def problem():
 
 def test_a_table_in_tiles_is_the_table(problem):
     """Derivatives by everything that is free, as one program with and without tiles."""
-    network, at = problem.network, present(problem.network, problem.base)
+    network, at = problem.network, present(problem.network, problem.base, slopes=True)
     for factor, packets in zip(network.pixels, problem.packets, strict=False):
 
         @eqx.filter_jit

@@ -51,7 +51,7 @@ def forward_jacobian(flat, network):
 
 def linearised(factor, network, flat, live=(), tangent=False):
     """A table with its derivatives."""
-    return linearise(factor, network, present(network, flat), live, tangent)
+    return linearise(factor, network, present(network, flat, slopes=True), live, tangent)
 
 
 @eqx.filter_jit

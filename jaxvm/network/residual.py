@@ -117,18 +117,22 @@ class Present(NamedTuple):
         flat: the state.
         rotation: of each pose.
         lever: left Jacobian of each rotation: exp(turn + d) = exp(lever d) exp(turn).
-        values, slopes: of the courses of the effects' columns, and by their constants.
+        values: of the courses of the effects' columns.
+        slopes: of the same by their constants; None where they are not wanted.
     """
 
     flat: Float[Array, " n"]
     rotation: Float[Array, "poses 3 3"]
     lever: Float[Array, "poses 3 3"]
     values: Float[Array, "columns views"]
-    slopes: Float[Array, "columns views 2"]
+    slopes: Float[Array, "columns views 2"] | None
 
 
-def present(network: Network, flat: Float[Array, " n"]) -> Present:
-    """A state as observations need it, each pose turned into a rotation once."""
+def present(network: Network, flat: Float[Array, " n"], slopes: bool = False) -> Present:
+    """A state as observations need it, each pose turned into a rotation once.
+
+    With `slopes` also as their derivatives by constants of effects need it.
+    """
     constant = flat[network.layout.all("constant")]
     (table,) = hosted(flat[: 6 * network.layout.n_poses])
     rotation, lever = by_blocks(_rotations, table.reshape(-1, 6)[:, :3])
@@ -137,7 +141,7 @@ def present(network: Network, flat: Float[Array, " n"]) -> Present:
         rotation,
         lever,
         courses(network.effects, constant, network.channels),
-        course_slopes(network.effects, constant, network.channels),
+        course_slopes(network.effects, constant, network.channels) if slopes else None,
     )
 
 
@@ -327,10 +331,11 @@ def linearise(
 ) -> Linearised:
     """Each row with its derivatives: by its live slots, and by the ports.
 
-    `live` are the positions along [own slots, amplitudes, constants] that are wanted. Reverse mode:
-    a row has one to six components and many slots. Whatever the number of effects, they enter
-    through the ports: one derivative by the ports serves all amplitudes and constants. Without any
-    the tangent is computed when it is asked for, else it is empty.
+    `live` are the positions along [own slots, amplitudes, constants] that are wanted; constants of
+    a state with their slopes alone (`present`). Reverse mode: a row has one to six components and
+    many slots. Whatever the number of effects, they enter through the ports: one derivative by the
+    ports serves all amplitudes and constants. Without any the tangent is computed when it is asked
+    for, else it is empty.
     """
     layout, n_own = network.layout, factor.slots.shape[1]
     acting, fed, only = _acting(network, at), _fed(factor, network), _used(factor)
@@ -352,9 +357,15 @@ def linearise(
         assert isinstance(factor, PixelFactor | RangeFactor)
         owner = _owners(network.effects, len(layout.all("constant")))
         table = (by_ports, factor.view, factor.pattern)
-        slopes = roomy(at.slopes, axis=1)
+        slopes = at.slopes
+        if slopes is None:
+            assert max(wanted) < len(layout.all("amplitude")), "constants are derived by slopes"
+            slopes = np.zeros((*at.values.shape, 2))
+        slopes = roomy(slopes, axis=1)
         by_effects = by_blocks(_by_effects, table, acting, slopes, owner, only=only)
-        by_effects = by_effects[:, :, np.asarray(wanted)]
+        together = wanted[-1] - wanted[0] == len(wanted) - 1  # they need no copy
+        chosen = slice(wanted[0], wanted[-1] + 1) if together else np.asarray(wanted)
+        by_effects = by_effects[:, :, chosen]
     joined: Any = np if isinstance(by_own, np.ndarray) else jnp
     return Linearised(value, joined.concatenate([by_own, by_effects], axis=2), by_ports)
 

@@ -152,13 +152,19 @@ class Problem(eqx.Module):
         raw, whiten, steps = [], [], []
         flat, per_parameter = flat_state(self, x)
         network, layout = self.network, self.network.layout
-        at = present(network, flat)
+        at = present(network, flat, slopes=self._constants_move())
         effects = np.concatenate([layout.all("amplitude"), layout.all("constant")])
         for factor, packets in zip(network.factors(), self.packets, strict=True):
             raw.append(linearise(factor, network, at, packets.live, tangent))
             whiten.append((factor.weight, factor.sigma))
             steps.append((factor.slots, jnp.asarray(effects), packets.live))
         return whitened(raw, whiten, steps, per_parameter)
+
+    def _constants_move(self) -> bool:
+        """Whether any table is derived by constants of effects."""
+        tables = zip(self.network.factors(), self.packets, strict=True)
+        amplitudes = len(self.network.layout.all("amplitude"))
+        return any(p.live and p.live[-1] >= f.slots.shape[1] + amplitudes for f, p in tables)
 
     def normal(self, x: Float[Array, " n"]) -> Normal:
         """Cost, gradient and Gauss-Newton matrix, with the weights of the robust loss."""

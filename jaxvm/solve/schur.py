@@ -81,7 +81,7 @@ def _linearised(problem: Problem, pattern: SchurPattern, x):
     """Cost, gradient, shared and local blocks, and couplings of all packets."""
     network, layout = problem.network, problem.network.layout
     flat, per_parameter = flat_state(problem, x)
-    at = present(network, flat)
+    at = present(network, flat, slopes=True)
     effects = jnp.asarray(np.concatenate([layout.all("amplitude"), layout.all("constant")]))
     cost, products, rest = jnp.zeros(()), [], []
     for factor, view in zip(network.factors(), pattern.tables, strict=True):

@@ -164,7 +164,7 @@ def _products(problem: Problem, packets_of: tuple[Packets, ...], x):
     """Cost, and J^T J and J^T r of some packets of every table."""
     network, layout = problem.network, problem.network.layout
     flat, per_parameter = flat_state(problem, x)
-    now = present(network, flat)
+    now = present(network, flat, slopes=True)
     effects = jnp.asarray(np.concatenate([layout.all("amplitude"), layout.all("constant")]))
 
     def of_packet(rows, factor, packets: Packets):
