@@ -120,12 +120,15 @@ def advise(
         return np.concatenate(found) / variance
 
     before = gaps(present)
+    effects = [effect for batch in batches for effect in batch.scene.effects]
+    # What does not go with time is the same on another day.
+    days = (False, True) if any(effect.driver == "time" for effect in effects) else (False,)
     advices = []
     for plan in plans:
         if not possible(plan, scene.recording):
             continue
         expected, drop = np.full(len(kept), np.inf), np.inf
-        for another_day in (False, True) if scene.recording.timed else (False,):
+        for another_day in days:
             further = planned(plan, scene, another_day)
             both = [
                 known + _information(batch.under(further.scene), further.weights)
