@@ -145,6 +145,7 @@ def _inside(scene: Scene, arrangement: Arrangement, scopes: tuple[Scope, ...]) -
 def course_tables(scene: Scene, families: tuple[Family, ...]) -> list[np.ndarray]:
     """Courses [courses, bases, views] of each family."""
     channels = scene.network.channels
+    number = {name: k for k, name in enumerate(channels.names)}
     place: dict[tuple, int] = {}
     columns, index = [], []
     for family in families:
@@ -157,8 +158,7 @@ def course_tables(scene: Scene, families: tuple[Family, ...]) -> list[np.ndarray
                 if key not in place:
                     place[key] = len(columns)
                     own = (*course.constants, 1.0, 1.0)[:2]
-                    channel = channels.index(course.driver)
-                    columns.append((BASIS_INDEX[name], channel, reference, own))
+                    columns.append((BASIS_INDEX[name], number[course.driver], reference, own))
                 of_family.append(place[key])
         index.append(np.array(of_family).reshape(len(family.courses), family.n_bases))
     basis, channel, reference, constants = map(np.array, zip(*columns, strict=True))

@@ -52,8 +52,9 @@ def driver_kind(scene: Scene, driver: str) -> str:
     Time is "time or power-on" where nobody noted when the cameras were switched on.
     """
     channels = scene.network.channels
-    kind = channels.kinds[channels.index(driver)]
-    if kind == "time" and "power-on" not in channels.kinds:
+    kinds = channels.kinds
+    kind = kinds[channels.names.index(driver)]
+    if kind == "time" and "power-on" not in kinds:
         return "time or power-on"
     return "time" if kind == "order" else kind
 

@@ -25,7 +25,7 @@ from jaxvm.discover.groups import (
 )
 from jaxvm.discover.hypotheses import FREE, Family, Hypothesis
 from jaxvm.network.scene import Scene
-from jaxvm.physics.catalogue import CATALOGUE, Entry, entries_for
+from jaxvm.physics.catalogue import CATALOGUE, Entry, entries_for, entries_of
 from jaxvm.physics.catalogue.entry import EACH, each
 from jaxvm.physics.catalogue.maps import fine_image_map, image_map, plate_map
 from jaxvm.physics.drivers import OWN_BODY, OWN_POWER_ON
@@ -219,7 +219,7 @@ def _as_named(
     distinct = set(asked)
     together: dict[tuple, list[Group]] = {}
     for group in [*groups, *every_port()]:
-        entries = [e for e in CATALOGUE if group.terms in e.groups and e.entity == group.entity]
+        entries = entries_of(group.terms, group.entity)
         taken = {
             (driver, form)
             for driver, form in distinct

@@ -196,11 +196,11 @@ def tabulate(
         own = [first_constant + k for k in range(len(effect.constants))]
         constants[own] = effect.constants
         given = effect.amplitudes or (0.0,) * effect.n_columns
-        start = column
+        start, driver = column, channels.index(effect.driver)
         for term in effect.terms:
             for name in form.bases:
                 ports[column, PORT_INDEX[term.port]] = term.weight
-                channel[column] = channels.index(effect.driver)
+                channel[column] = driver
                 basis[column] = BASIS_INDEX[name]
                 reference[column] = effect.reference if form.centred else 0.0
                 constant_index[column, : len(own)] = own

@@ -16,12 +16,22 @@ from jaxvm.physics.catalogue.sensor import SENSOR
 from jaxvm.physics.catalogue.target import TARGET
 from jaxvm.physics.effects import Term
 
-__all__ = ["BY_ID", "CATALOGUE", "Entry", "entries_for"]
+__all__ = ["BY_ID", "CATALOGUE", "Entry", "entries_for", "entries_of"]
 
 CATALOGUE: tuple[Entry, ...] = (*TARGET, *MEDIUM, *MOUNT, *LENS, *SENSOR, *DETECTION, *RANGE)
 """All named physics, in the order of the chain."""
 
 BY_ID: dict[str, Entry] = {entry.id: entry for entry in CATALOGUE}
+
+_BY_TERMS: dict[tuple[tuple[Term, ...], str], list[Entry]] = {}
+for _entry in CATALOGUE:
+    for _terms in dict.fromkeys(_entry.groups):
+        _BY_TERMS.setdefault((_terms, _entry.entity), []).append(_entry)
+
+
+def entries_of(terms: tuple[Term, ...], entity: str) -> tuple[Entry, ...]:
+    """The entries that a combination of terms of one kind of entity belongs to."""
+    return tuple(_BY_TERMS.get((signature(terms), entity), ()))
 
 
 def entries_for(
@@ -33,11 +43,6 @@ def entries_for(
     "neighbour"). Where entries name a special kind, those that any recorded quantity may drive are
     not meant. Several entries are doubles that no recording of these cameras tells apart.
     """
-    terms = signature(terms)
-    known = [
-        entry
-        for entry in CATALOGUE
-        if terms in entry.groups and entity == entry.entity and entry.takes(driver_kinds, form)
-    ]
+    known = [entry for entry in entries_of(terms, entity) if entry.takes(driver_kinds, form)]
     special = [kind for kind in driver_kinds if kind != "quantity"] or driver_kinds
     return tuple([e for e in known if any(kind in e.drivers for kind in special)] or known)
