@@ -166,7 +166,10 @@ def _family(scene: Scene, groups, courses, scopes, named: dict[str, int]) -> Fam
     asked = Counter(kind for kind, _ in distinct)
     faces = _faces(scene)
     group_scope = np.array([[_has(scope, group, faces) for scope in scopes] for group in groups])
-    course_scope = np.array([[_follows(scene, s, course) for s in scopes] for course in courses])
+    # Courses that differ in their constants alone are followed by the same bodies.
+    alike = {(course.driver, course.form): course for course in courses}
+    known = {key: [_follows(scene, s, course) for s in scopes] for key, course in alike.items()}
+    course_scope = np.array([known[course.driver, course.form] for course in courses])
     valid = group_scope[:, None, :] & course_scope[None]
     # What nothing in this recording has (a rangefinder, say) is not computed either.
     seen = np.flatnonzero(valid.any(axis=(1, 2)))
