@@ -11,7 +11,7 @@ from jaxvm.discover.hypotheses import Hypothesis
 from jaxvm.discover.ranking import top
 from jaxvm.discover.rivals import rivals
 from jaxvm.discover.score import ScoreTests
-from jaxvm.discover.select import decisive_gap, refit
+from jaxvm.discover.select import decisive_gap, refit, stacked
 from jaxvm.discover.space import enumerate_hypotheses
 from jaxvm.network.scene import build
 from jaxvm.network.start import start
@@ -69,3 +69,30 @@ def test_a_line_is_a_rival_of_its_parabola_while_it_saves_more_than_it_loses(
     # ... but a column costs ln n.
     assert bool(lines) == shown
     assert (deviations**2 < decisive_gap(drop) + np.log(parts.n)) == shown
+
+
+def test_what_no_hypothesis_explains_of_the_change_speaks_against_none(warmed, monkeypatch):
+    """From one fit to the other patterns move with the image: a part of it is no tangent."""
+    _, _, _, found = fitted(warmed, 0.0)
+    bend = 2.0 * effect_deviations(found.adjustment)[-1][1] - found.amplitudes[1]
+    parts, plain, tests, found = fitted(warmed, bend)
+
+    def asked():
+        own = found.hypothesis, found.effect
+        chief, others = rivals(plain, found.adjustment, *own, tests, parts.n)
+        return {(r.hypothesis.group, r.hypothesis.scope): r.weight for r in others}, chief.weight
+
+    others, own = asked()
+    assert others and own < 0.99
+    change = stacked(plain)
+    besides = np.random.default_rng(0).standard_normal(change.shape) * (change != 0.0)
+    besides *= np.sqrt(4.0 * 53.0 / np.sum(besides**2))
+    assert 53.0 > decisive_gap(2.0 * (plain.cost - found.adjustment.cost))
+
+    def more(fit):
+        return stacked(fit) + (besides if fit is plain else 0.0)
+
+    monkeypatch.setattr("jaxvm.discover.rivals.stacked", more)
+    still, weight = asked()
+    assert still.keys() == others.keys()
+    assert weight == pytest.approx(own, abs=0.1)

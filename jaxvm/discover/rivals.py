@@ -111,10 +111,13 @@ def rivals(
 
     scene, found = before.scene, []
     refined = _at(tests.battery.families, effect)
-    for some in (tests, tests.about(refined) if refined else None):
-        if some is not None:
-            alike = some.score(variance, residual=change)
-            found += list(_resembling(alike, scene, own, full, variance, limit + saved))
+    asked = [tests, *([tests.about(refined)] if refined else [])]
+    alike = [some.score(variance, residual=change) for some in asked]
+    # What its own tangent does not explain (the way from one fit to the other is no straight line)
+    # speaks against no other hypothesis either.
+    full = min(full, _explained(alike[-1], own, effect, variance) or full)
+    for ranking in alike:
+        found += list(_resembling(ranking, scene, own, full, variance, limit + saved))
     own_price = min((price for h, _, price, _ in found if h.same(own)), default=0.0)
     prices = {_course_of(h): price for h, _, price, _ in reversed(found)}
     for hypothesis, gap, _, amplitudes in found:
@@ -195,6 +198,22 @@ def _resembling(
                 gap = float(max(full - best[g, s], 0.0))
                 price = float(best[g, s] - mean)
                 yield member(family, index, scene), gap, price, scores.amplitude[index]
+
+
+def _explained(ranking: Ranking, own: Hypothesis, effect: Effect, variance: float) -> float:
+    """What a hypothesis explains of its own effect, at its own constants; 0 where not asked."""
+    course, drops = (effect.driver, effect.form, effect.constants), [0.0]
+    for scores in ranking.scores:
+        family = scores.family
+        same = [
+            c for c, o in enumerate(family.courses) if (o.driver, o.form, o.constants) == course
+        ]
+        # A mark is in the scope of all, and its group's own.
+        place = [own.group.mark is not None or scope == own.scope for scope in family.scopes]
+        for g in (g for g, group in enumerate(family.groups) if group == own.group):
+            for c in same:
+                drops += (scores.drop[g, c, place & scores.valid[g, c]] / variance).tolist()
+    return max(drops)
 
 
 def _at(families: tuple[Family, ...], effect: Effect) -> tuple[Family, ...]:
