@@ -64,14 +64,18 @@ class program(Generic[P, R]):  # noqa: N801 (a decorator)
         _everything.append(self)
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        leaves, structure = jax.tree.flatten((args, kwargs))
+        return self.of_leaves(leaves, structure)
+
+    def of_leaves(self, leaves: list, structure) -> R:
+        """The result for arguments and keywords that are taken apart: `jax.tree.flatten`."""
         settings: Any = jax.config
         if settings.jax_disable_jit or settings.jax_debug_nans:
-            return self._traced(*args, **kwargs)
-        leaves, structure = jax.tree.flatten((args, kwargs))
+            return self._by_jax(leaves, structure)
         arrays, key = [], [structure, settings.jax_enable_x64]
         for leaf in leaves:
             if isinstance(leaf, Tracer):
-                return self._traced(*args, **kwargs)
+                return self._by_jax(leaves, structure)
             if isinstance(leaf, jax.Array):
                 arrays.append(leaf)
                 key.append((leaf.shape, leaf.dtype, leaf.weak_type))
@@ -86,10 +90,15 @@ class program(Generic[P, R]):  # noqa: N801 (a decorator)
         if ready is None:
             ready = self._ready[key] = self._made_ready(structure, leaves, key)
         if ready == "traced":
-            return self._traced(*args, **kwargs)
+            return self._by_jax(leaves, structure)
         executable, result, others = ready
         found = iter(executable(*arrays))
         return jax.tree.unflatten(result, [next(found) if o is ... else o for o in others])
+
+    def _by_jax(self, leaves: list, structure) -> R:
+        args, kwargs = jax.tree.unflatten(structure, leaves)
+        traced: Any = self._traced
+        return traced(*args, **kwargs)
 
     def __get__(self, instance, owner=None):
         return self if instance is None else functools.partial(self, instance)

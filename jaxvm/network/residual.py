@@ -167,24 +167,16 @@ def _used(factor: Factor) -> np.ndarray | None:
 
 
 def _chained(function, factor: Factor, at: Present, ports, only):
-    """A function of a table, the flat state and the port values of each row, block by block.
+    """A function of a table with the port values of its rows, and of the state, block by block.
 
     It knows nothing of effects, so their number changes no program of the chain. Where the table is
     one program and nothing acts on it, tiles of rows are computed number by number.
     """
-    n = factor.slots.shape[0]
     shared = at.flat, at.rotation, at.lever
     factor = factor.bare()
     if ports is None and isinstance(factor, PixelFactor) and factor.tiles and whole(factor, shared):
-        return function(factor, shared, None)
-    ports = np.zeros((n, 0)) if ports is None else ports
-    table = factor.untiled(), ports
-    return by_blocks(partial(_apart, function), table, tuple(map(roomy, shared)), only=only)
-
-
-def _apart(function, table, shared):
-    factor, ports = table
-    return function(factor, shared, ports if ports.shape[1] else None)
+        return function((factor, None), shared)
+    return by_blocks(function, (factor.untiled(), ports), tuple(map(roomy, shared)), only=only)
 
 
 class Fed(NamedTuple):
@@ -290,7 +282,9 @@ def _by_numbers(function, factor: Factor, shared, ports) -> Any:
 
 
 @program
-def _values(factor: Factor, shared, ports, dear: bool) -> Float[Array, "observations components"]:
+def _values(table, shared, dear: bool) -> Float[Array, "observations components"]:
+    factor, ports = table
+
     def local(own, ports, data):
         return factor.local(list(map(_still, own)), data, PortValues(ports, dear))
 
@@ -403,10 +397,11 @@ def _by_effects(table, acting: Acting, slopes, owner):
 
 
 @program
-def _derivatives(factor: Factor, shared, ports, live: tuple[int, ...], dear: bool):
+def _derivatives(table, shared, live: tuple[int, ...], dear: bool):
     """Values of the rows, and their derivatives by live slots of their own and by all ports."""
+    factor, ports = table
     if not live and ports is None:
-        value = _values(factor, shared, None, dear=False)
+        value = _values(table, shared, dear=False)
         return value, *(2 * (jnp.zeros((*value.shape, 0)),))
     return _by_rows(_derivatives_of_row(factor, live, dear), factor, shared, ports)
 

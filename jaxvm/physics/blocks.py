@@ -7,11 +7,14 @@ table would serve recordings of that very size alone. Under a transformation of 
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
 import numpy as np
 from jax.core import Tracer
+
+from jaxvm.compiling import program
 
 BLOCK = 1024
 """Rows of a block."""
@@ -45,8 +48,15 @@ def by_blocks(
     """
     if whole(table, common):
         return function(table, *common)
-    leaves, structure = jax.tree.flatten(table)
-    leaves = [np.asarray(leaf) for leaf in leaves]
+    named = {}
+    while isinstance(function, partial) and not function.args:
+        named = function.keywords | named
+        function = function.func
+    # All blocks have one structure: to put each together and take it apart again takes as long as
+    # to run many a program.
+    leaves, structure = jax.tree.flatten(((table, *common), named))
+    n_leaves = jax.tree.structure(table).num_leaves
+    leaves, others = [np.asarray(leaf) for leaf in leaves[:n_leaves]], leaves[n_leaves:]
     n = max(len(leaf) for leaf in leaves if leaf.ndim)
     size = size or (_SMALL if n <= _SMALL else BLOCK)
     only = None if only is None or len(only) == n else only
@@ -55,7 +65,11 @@ def by_blocks(
     # Without any row the shape of the result is that of a block.
     for start in range(0, max(wanted, 1), size):
         block = [_cut(leaf, start, size, only) if leaf.ndim else leaf for leaf in leaves]
-        found.append(function(jax.tree.unflatten(structure, block), *common))
+        if isinstance(function, program):
+            found.append(function.of_leaves([*block, *others], structure))
+        else:
+            args, kwargs = jax.tree.unflatten(structure, [*block, *others])
+            found.append(function(*args, **kwargs))
 
     def joined(*parts):
         values = np.concatenate(parts)[:wanted]
