@@ -1,13 +1,13 @@
 """Follow the advice: record what a diagnosis asked for, diagnose both together, count.
 
-`python benchmarks/sealed/follow.py DIR [--count 20] [--jobs 2]`
+`python benchmarks/sealed/follow.py DIR [--label NAME] [--count 20] [--jobs 2]`
 
 Takes scored recordings (`solve.py`, `score.py`) in which a finding has doubles and advice. The
 world makes the same scene again under the plan that was named best, `jaxvm diagnose FIRST --with
 SECOND` sees the two and nothing else, and the key tells whether the doubles came apart: the right
 name in a set that has no longer both names of any pair that the plan promised to part. Stricter are
 *first*: it leads there, too; and *alone*: no other name at all is left. Writes DIR/follow.json and
-prints a table.
+benchmarks/sealed/follow-NAME.md.
 """
 
 import argparse
@@ -24,6 +24,8 @@ from names import Facts, same_name
 from score import sealed_key
 from solve import copy_recording, environment
 from world import record
+
+HERE = Path(__file__).parent
 
 
 def asked(folder: Path, entries: list[dict]) -> list[dict]:
@@ -110,9 +112,43 @@ def outcome(case: dict, report: dict, facts: Facts) -> dict:
     }
 
 
+def markdown(label: str, results: list[dict]) -> str:
+    """What came of every case, and how many came apart."""
+    number, expected = len(results), sum(case["chance"] for case in results)
+    apart, first, alone = (
+        sum(case.get(key, False) for case in results) for key in ("apart", "first", "alone")
+    )
+    rows = [
+        f"| {case['id']} | {', '.join(case['hidden'])} | {', '.join(case['before'])} "
+        f"| {case['plan']} | {case['chance']:.0%} | {_came_of(case)} |"
+        for case in results
+    ]
+    return "\n".join(
+        [
+            f"# Advice followed on sealed set {label}",
+            "",
+            f"{apart} of {number} findings that were promised to come apart from their doubles did "
+            f"({expected:.1f} expected), {first} with the right name first, {alone} with it alone.",
+            "",
+            "| recording | hidden | finding and doubles | plan | promised | both together |",
+            "|---|---|---|---|---|---|",
+            *rows,
+            "",
+        ]
+    )
+
+
+def _came_of(case: dict) -> str:
+    if "failed" in case:
+        return f"failed: {' '.join(case['failed'])}"
+    named = "; ".join(", ".join(names) for names in case["after"]) or "nothing found"
+    return f"{'apart' if case['apart'] else 'not apart'}: {named}"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description="record what the diagnoses advised, and see")
     parser.add_argument("folder", type=Path, metavar="DIR")
+    parser.add_argument("--label", help="name of the table; that of the folder by default")
     parser.add_argument("--count", type=int, default=20)
     parser.add_argument("--jobs", type=int, default=2)
     options = parser.parse_args()
@@ -129,12 +165,10 @@ def main() -> None:
             state = "apart" if case.get("apart") else case.get("after", case.get("failed"))
             words = f"{case['id']}  {case['hidden']}  {case['before']}  {case['plan']}"
             print(f"{words}  ({case['chance']:.0%}): {state}", flush=True)
-    apart, first, alone = (
-        sum(case.get(key, False) for case in results) for key in ("apart", "first", "alone")
-    )
-    number, expected = len(results), sum(case["chance"] for case in results)
-    print(f"{apart} of {number} that were promised to come apart did ({expected:.1f} expected),")
-    print(f"{first} of them with the right name first, {alone} with it alone")
+    label = options.label or folder.name
+    text = markdown(label, results)
+    (HERE / f"follow-{label}.md").write_text(text, encoding="utf-8")
+    print(text.splitlines()[2])
     (folder / "follow.json").write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
 
 
