@@ -25,6 +25,10 @@ MOST, PLACES = 12, 3
 
 _ODDS = 20.0
 
+_LEAST = 0.5
+"""Share of the change that a hypothesis must explain of itself to be what others are held against:
+of less its tangent says nothing."""
+
 
 @dataclass(frozen=True)
 class Rival:
@@ -115,7 +119,8 @@ def rivals(
     alike = [some.score(variance, residual=change) for some in asked]
     # What its own tangent does not explain (the way from one fit to the other is no straight line)
     # speaks against no other hypothesis either.
-    full = min(full, _explained(alike[-1], own, effect, variance) or full)
+    explained = _explained(alike[-1], own, effect, variance)
+    full = float(np.clip(explained, _LEAST * full, full)) if explained > 0.0 else full
     for ranking in alike:
         found += list(_resembling(ranking, scene, own, full, variance, limit + saved))
     own_price = min((price for h, _, price, _ in found if h.same(own)), default=0.0)
