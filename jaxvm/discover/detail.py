@@ -14,6 +14,7 @@ from jaxvm.discover.diagnosis import Finding
 from jaxvm.discover.groups import Group
 from jaxvm.discover.heldout import HeldOut, Split, gain
 from jaxvm.discover.hypotheses import Hypothesis
+from jaxvm.discover.revise import given_effects
 from jaxvm.network.scene import Scene
 from jaxvm.physics.catalogue.maps import fine_plate_map, finest_image_map
 from jaxvm.physics.effects import Effect, room_for
@@ -43,7 +44,7 @@ def with_detail(
             # A name that does alone needs no map.
             if len(members) < 2 and all(f.hypothesis.entries for f in members):
                 continue
-            given = len(current.scene.effects) - len(findings)
+            given = given_effects(current, findings)
             kept = [k for k, f in enumerate(findings) if not any(f is m for m in members)]
             effects = current.scene.fitted_effects()
             others = (*effects[:given], *(effects[given + k] for k in kept))

@@ -12,7 +12,7 @@ import numpy as np
 from jaxvm.discover.diagnosis import Finding
 from jaxvm.discover.heldout import HeldOut, Split
 from jaxvm.discover.hypotheses import FREE
-from jaxvm.discover.revise import followed, likelier, rename
+from jaxvm.discover.revise import followed, given_effects, likelier, rename
 from jaxvm.discover.rivals import rivals
 from jaxvm.discover.score import ScoreTests
 from jaxvm.discover.select import shortlist
@@ -119,7 +119,7 @@ class Naming:
             without,
             current,
             finding.hypothesis,
-            current.scene.fitted_effects()[_given(current, findings) + k],
+            current.scene.fitted_effects()[given_effects(current, findings) + k],
             self.tests.at(without),
             self.parts.n,
             shown,
@@ -129,11 +129,6 @@ class Naming:
 
     def _without(self, current: Adjustment, findings: list[Finding], k: int) -> Adjustment:
         """The fit with all findings but one."""
-        effects, place = current.scene.fitted_effects(), _given(current, findings) + k
+        effects, place = current.scene.fitted_effects(), given_effects(current, findings) + k
         others = (*effects[:place], *effects[place + 1 :])
         return self.parts.fit(current.scene.with_effects(others, current.scene.room))
-
-
-def _given(current: Adjustment, findings: list[Finding]) -> int:
-    """Number of effects that the engineer's model has itself."""
-    return len(current.scene.effects) - len(findings)

@@ -34,6 +34,11 @@ _LIKELIER = 2.0
 """Odds from which a double leads in place of what fits best; less is within what odds are worth."""
 
 
+def given_effects(current: Adjustment, findings: list[Finding]) -> int:
+    """Number of effects before the findings: the engineer's model has them itself."""
+    return len(current.scene.effects) - len(findings)
+
+
 def prune(
     current: Adjustment, findings: list[Finding], n: int, fit: Fit
 ) -> tuple[Adjustment, list[Finding]]:
@@ -42,7 +47,7 @@ def prune(
     Amounts of every image can follow whatever has a course, but must be larger for it: what the
     course saves them counts for it.
     """
-    given = len(current.scene.effects) - len(findings)
+    given = given_effects(current, findings)
     effects, lost = current.scene.fitted_effects(), lost_without(current, findings)
     for k, finding in enumerate(findings[:-1]):
         drop = lost[k] / current.variance_factor
@@ -116,7 +121,7 @@ def _better(
 
     And the place of that one: others may be superfluous then.
     """
-    scene, given = current.scene, len(current.scene.effects) - len(findings)
+    scene, given = current.scene, given_effects(current, findings)
     effects = list(scene.fitted_effects())
     effects[given + k] = other.effect(np.zeros(other.n_columns))
     # Even if it made all the others superfluous, it would have to come so far down.
@@ -156,7 +161,7 @@ def likelier(
     if best is None or best.weight < odds * finding.weight:
         return current, findings
     effects = list(scene.fitted_effects())
-    effects[len(effects) - len(findings) + k] = best.hypothesis.effect(
+    effects[given_effects(current, findings) + k] = best.hypothesis.effect(
         np.zeros(best.hypothesis.n_columns)
     )
     tried = fit(scene.with_effects(tuple(effects), room_for(tuple(effects), scene.room)))
@@ -178,7 +183,7 @@ def likelier(
 def with_effects(findings: list[Finding], fitted: Adjustment) -> list[Finding]:
     """Findings with the values of a fit that has them all."""
     effects = fitted.scene.fitted_effects()
-    effects = effects[len(effects) - len(findings) :]
+    effects = effects[given_effects(fitted, findings) :]
     return [
         replace(finding, effect=effect, final_effect=effect)
         for finding, effect in zip(findings, effects, strict=True)
@@ -211,5 +216,5 @@ def _price_of(finding: Finding, drop: float, n: int) -> float:
 
 def lost_without(current: Adjustment, findings: list[Finding]) -> list[float]:
     """Rise of twice the cost without each finding, all others refitted (Wald)."""
-    places = current.scene.places()[len(current.scene.effects) - len(findings) :]
+    places = current.scene.places()[given_effects(current, findings) :]
     return wald_drops(current, [np.arange(own.start, own.stop) for own, _ in places])
