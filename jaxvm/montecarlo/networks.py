@@ -21,7 +21,7 @@ from jaxvm.montecarlo.results import Results
 from jaxvm.montecarlo.run import Progress, run
 from jaxvm.montecarlo.trials import Traced, Trial, fingerprint, name_of
 from jaxvm.network.draw import Noise, drawn, with_measurements
-from jaxvm.network.residual import Network
+from jaxvm.network.network import Network
 from jaxvm.network.scene import Scene
 from jaxvm.network.state import State
 from jaxvm.solve.adjust import degrees_of_freedom

@@ -13,7 +13,8 @@ from jaxtyping import Array
 
 from jaxvm.compiling import program
 from jaxvm.network.factors import PixelFactor, PriorFactor, RangeFactor
-from jaxvm.network.residual import Network, parts_of
+from jaxvm.network.network import Network
+from jaxvm.network.residual import parts_of
 from jaxvm.network.tables import Tables
 from jaxvm.physics.blocks import by_blocks, roomy
 from jaxvm.physics.chain import Aim, Sight

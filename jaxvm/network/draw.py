@@ -10,7 +10,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxvm.geometry.poses import pose_from_vector, se3_exp, vector_from_pose
 from jaxvm.network.factors import Factor, LinkFactor, link_pose
-from jaxvm.network.residual import Network, parts_of, present, rows
+from jaxvm.network.network import Network
+from jaxvm.network.residual import parts_of, present, rows
 from jaxvm.network.state import State
 
 Noise = Callable[[PRNGKeyArray, tuple[int, ...]], Float[Array, "..."]]

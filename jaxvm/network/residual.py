@@ -3,11 +3,9 @@
 Simulation, adjustment, covariance, Monte Carlo and diagnosis all call what stands here.
 """
 
-from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,66 +15,13 @@ from jaxvm.compiling import program
 from jaxvm.geometry.poses import Pose, TurnedPose
 from jaxvm.geometry.rotations import so3_exp, so3_left_jacobian
 from jaxvm.network.componentwise import Numbers, componentwise, joined
-from jaxvm.network.factors import (
-    ClosureFactor,
-    EdgeFactor,
-    Factor,
-    LinkFactor,
-    PixelFactor,
-    PriorFactor,
-    RangeFactor,
-)
-from jaxvm.network.state import Layout, State
+from jaxvm.network.factors import Factor, PixelFactor, RangeFactor
+from jaxvm.network.network import Network, Residuals
+from jaxvm.network.state import State
 from jaxvm.network.tiles import Tiles
 from jaxvm.physics.blocks import by_blocks, hosted, roomy, whole
-from jaxvm.physics.effects import Channels, EffectTable, course_slopes, courses
+from jaxvm.physics.effects import EffectTable, course_slopes, courses
 from jaxvm.physics.ports import DEAR, N_PORTS, PORT_INDEX, PortValues
-
-
-class Network(eqx.Module):
-    """Everything but the state: tables of observations, effects, channels.
-
-    Attributes:
-        pixels: one table for each family of lenses.
-        ranges, links, edges, closures, priors: the other observations; tables may be empty.
-        effects: the physics beyond the plain chain, as a table.
-        channels: time-like drivers.
-        layout: how the state is laid out.
-    """
-
-    pixels: tuple[PixelFactor, ...]
-    ranges: RangeFactor | None
-    links: LinkFactor | None
-    edges: EdgeFactor | None
-    closures: ClosureFactor | None
-    priors: PriorFactor | None
-    effects: EffectTable
-    channels: Channels
-    layout: Layout = eqx.field(static=True)
-
-    def factors(self) -> tuple[Factor, ...]:
-        """All tables that hold observations, in the order of `Residuals`."""
-        others = (self.ranges, self.links, self.edges, self.closures, self.priors)
-        return (*self.pixels, *(factor for factor in others if factor is not None))
-
-    def residuals(self, blocks: Sequence) -> "Residuals":
-        """Blocks of all tables, in the order of `factors`, by their names."""
-        n = len(self.pixels)
-        left = iter(blocks[n:])
-        others = (self.ranges, self.links, self.edges, self.closures, self.priors)
-        rest = (None if factor is None else next(left) for factor in others)
-        return Residuals(tuple(blocks[:n]), *rest)
-
-
-class Residuals(NamedTuple):
-    """Whitened residuals, (predicted - measured) / sigma, block by block."""
-
-    pixels: tuple[Float[Array, "observations 2"], ...]
-    ranges: Float[Array, "observations 1"] | None
-    links: Float[Array, "observations 6"] | None
-    edges: Float[Array, "observations 6"] | None
-    closures: Float[Array, "observations 6"] | None
-    priors: Float[Array, "observations 1"] | None
 
 
 def residual(state: State, network: Network) -> Residuals:

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxvm.geometry.matrices import matrices, vectors
 from jaxvm.network.binding import bind
-from jaxvm.network.residual import Network
+from jaxvm.network.network import Network
 from jaxvm.network.state import N_DISTORTION, Layout, State
 from jaxvm.network.tables import Tables
 from jaxvm.network.unknowns import Unknowns, free_unknowns

@@ -11,7 +11,8 @@ import optimistix as optx
 from jax.sharding import Mesh
 
 from jaxvm.compiling import compile_seconds, program
-from jaxvm.network.residual import Residuals, residual
+from jaxvm.network.network import Residuals
+from jaxvm.network.residual import residual
 from jaxvm.network.scene import Scene
 from jaxvm.solve.descent import Descent
 from jaxvm.solve.gauge import check_gauge

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxvm.compiling import program
-from jaxvm.network.residual import Residuals
+from jaxvm.network.network import Residuals
 from jaxvm.network.state import State
 from jaxvm.solve.adjust import Adjustment
 from jaxvm.solve.arrow import ArrowFactors, factorise

@@ -15,7 +15,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxvm.compiling import program
 from jaxvm.network.factors import Factor
-from jaxvm.network.residual import Linearised, Network, Residuals, linearise, present, residual
+from jaxvm.network.network import Network, Residuals
+from jaxvm.network.residual import Linearised, linearise, present, residual
 from jaxvm.network.scene import Scene
 from jaxvm.network.state import Layout, State
 from jaxvm.network.unknowns import Unknowns

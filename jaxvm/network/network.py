@@ -1,0 +1,65 @@
+"""What a network is apart from its state, and what its residuals are called."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from jaxvm.network.factors import (
+    ClosureFactor,
+    EdgeFactor,
+    Factor,
+    LinkFactor,
+    PixelFactor,
+    PriorFactor,
+    RangeFactor,
+)
+from jaxvm.network.state import Layout
+from jaxvm.physics.effects import Channels, EffectTable
+
+
+class Network(eqx.Module):
+    """Everything but the state: tables of observations, effects, channels.
+
+    Attributes:
+        pixels: one table for each family of lenses.
+        ranges, links, edges, closures, priors: the other observations; tables may be empty.
+        effects: the physics beyond the plain chain, as a table.
+        channels: time-like drivers.
+        layout: how the state is laid out.
+    """
+
+    pixels: tuple[PixelFactor, ...]
+    ranges: RangeFactor | None
+    links: LinkFactor | None
+    edges: EdgeFactor | None
+    closures: ClosureFactor | None
+    priors: PriorFactor | None
+    effects: EffectTable
+    channels: Channels
+    layout: Layout = eqx.field(static=True)
+
+    def factors(self) -> tuple[Factor, ...]:
+        """All tables that hold observations, in the order of `Residuals`."""
+        others = (self.ranges, self.links, self.edges, self.closures, self.priors)
+        return (*self.pixels, *(factor for factor in others if factor is not None))
+
+    def residuals(self, blocks: Sequence) -> "Residuals":
+        """Blocks of all tables, in the order of `factors`, by their names."""
+        n = len(self.pixels)
+        left = iter(blocks[n:])
+        others = (self.ranges, self.links, self.edges, self.closures, self.priors)
+        rest = (None if factor is None else next(left) for factor in others)
+        return Residuals(tuple(blocks[:n]), *rest)
+
+
+class Residuals(NamedTuple):
+    """Whitened residuals, (predicted - measured) / sigma, block by block."""
+
+    pixels: tuple[Float[Array, "observations 2"], ...]
+    ranges: Float[Array, "observations 1"] | None
+    links: Float[Array, "observations 6"] | None
+    edges: Float[Array, "observations 6"] | None
+    closures: Float[Array, "observations 6"] | None
+    priors: Float[Array, "observations 1"] | None
