@@ -14,6 +14,7 @@ from jaxvm.discover.noise import random_signs
 from jaxvm.discover.products import Tangents, whitener_of
 from jaxvm.discover.ranking import surprise
 from jaxvm.discover.score import ScoreTests
+from jaxvm.discover.select import stacked
 from jaxvm.discover.space import enumerate_hypotheses, member
 from jaxvm.network.residual import residual
 from jaxvm.physics.drivers import OWN_BODY
@@ -147,6 +148,25 @@ def test_no_hypothesis_is_beyond_what_noise_gives(stereo):
     signs = random_signs(len(scene.recording.time), 99, 0)
     found = ScoreTests.of(stereo, enumerate_hypotheses(scene)).score(1.0, signs)
     assert found.p_value(found.best_z()) > 0.01
+
+
+def test_the_null_distribution_is_that_of_residuals_with_other_signs(stereo):
+    """Each repetition is scored as if those residuals had been measured."""
+    scene = stereo.scene
+    signs = random_signs(len(scene.recording.time), 3, 0)
+    tests = ScoreTests.of(stereo, enumerate_hypotheses(scene))
+    found = tests.score(1.0, signs)
+    residual = stacked(stereo)
+    epoch = np.zeros(len(residual), int)
+    epochs = [scene.recording.observations.epoch[rows] for rows in scene.tables]
+    if scene.recording.ranges is not None:
+        epochs.append(scene.recording.ranges.epoch)
+    for start, own in zip(tests.arrangement.starts, epochs, strict=True):
+        epoch[start : start + len(own)] = own
+    for k, largest in enumerate(found.null):
+        flipped = residual * signs[epoch, k][:, None]
+        lost = 1.0 - 1.0 / len(signs)
+        assert tests.score(lost, residual=flipped).best_z() == pytest.approx(largest, rel=1e-4)
 
 
 def test_a_surprise_is_the_log_of_a_tail():
