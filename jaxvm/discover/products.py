@@ -22,6 +22,10 @@ CELLS = 256
 """Cells whose tangents are multiplied at a time: of fewer, threads wait for each other."""
 
 
+MANY_TERMS_CELLS = 32
+"""The same of a group of very many terms: each acts in few of them."""
+
+
 @dataclass(frozen=True)
 class Tangents:
     """Products of the tangents of one group, before its courses, in each cell.
@@ -54,12 +58,16 @@ class Tangents:
         if self.square is None:
             assert self.stack is not None
             gram = np.zeros((b, k * n_bases, k * n_bases))
-            for first in range(0, n, CELLS):
-                here = slice(first, first + CELLS)
+            # Of so many terms each acts on a few images, or marks, alone.
+            for first in range(0, n, MANY_TERMS_CELLS):
+                here = slice(first, first + MANY_TERMS_CELLS)
                 piece = np.swapaxes(self.stack[cells[here]], 0, 1)  # k n rows
+                acting = np.flatnonzero(piece.any(axis=(1, 2)))
+                piece = piece[acting]
+                place = (acting[:, None] * n_bases + np.arange(n_bases)).ravel()
                 for own, course in zip(gram, weights[:, :, here], strict=True):
-                    columns = (piece[:, None] * course[:, :, None]).reshape(k * n_bases, -1)
-                    own += columns @ columns.T
+                    columns = (piece[:, None] * course[:, :, None]).reshape(len(place), -1)
+                    own[np.ix_(place, place)] += columns @ columns.T
             return gram
         square = at_cells(self.square, cells)
         if n_bases == 1:

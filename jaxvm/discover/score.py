@@ -32,6 +32,7 @@ from jaxvm.discover.hypotheses import Family
 from jaxvm.discover.once import once
 from jaxvm.discover.products import (
     CELLS,
+    MANY_TERMS_CELLS,
     Information,
     Tangents,
     at_cells,
@@ -182,63 +183,84 @@ class ScoreTests:
                 found[key] = self._of_mark(group, group.mark, residual, full)
             # Of very many terms the products would take more room than the tangents.
             elif len(group.terms) > height:
-                (found[key],) = self._of_groups([group], residual, full, wide=True)
+                found[key] = self._of_many_terms(group, residual, full)
             else:
                 alike.append(key)
         some = [families[number].groups[g] for number, g in alike]
         if some:
-            products = self._of_groups(some, residual, full, wide=False)
+            products = self._of_groups(some, residual, full)
             found.update(zip(alike, products, strict=True))
         return found
 
     def _of_groups(
-        self, groups: list[Group], residual: np.ndarray, full: bool, wide: bool
+        self, groups: list[Group], residual: np.ndarray, full: bool
     ) -> Iterator[Tangents]:
         """Products of the tangents of groups that act on all marks, some cells at a time.
 
         What is multiplied stays in the cache, and what all groups share is read once.
         """
         cells, (n, height) = self.arrangement.cells, residual.shape
-        by_component = n, self.arrangement.components, -1
         ends = np.cumsum([len(group.terms) for group in groups])
         each = [slice(end - len(g.terms), end) for g, end in zip(groups, ends, strict=True)]
-        own = [
-            (
-                cells.tangent[PORT_INDEX[term.port]].reshape(by_component),
-                self._pattern(term)[:, None],
-            )
-            for group in groups
-            for term in group.terms
-        ]
+        own = [factors for group in groups for factors in self._factors(group)]
         product = np.empty((n, len(own)))
         halves = [np.empty((n, len(g.terms), cells.half.shape[2])) for g in groups if full]
-        square = [] if wide else [np.empty((n, *2 * (len(g.terms),))) for g in groups]
-        stack = np.empty((n if wide else CELLS, len(own), *own[0][0].shape[1:]))
+        square = [np.empty((n, *2 * (len(g.terms),))) for g in groups]
+        stack = np.empty((min(CELLS, n), len(own), *own[0][0].shape[1:]))
         for first in range(0, n, CELLS):
             here = slice(first, min(first + CELLS, n))
-            apart = stack[here] if wide else stack[: min(CELLS, n - first)]
+            apart = stack[: here.stop - first]
             for k, (tangent, pattern) in enumerate(own):
                 np.multiply(tangent[here], pattern[here], out=apart[:, k])
             piece = apart.reshape(*apart.shape[:2], height)
             product[here] = (piece @ residual[here, :, None])[:, :, 0]
             half = piece @ cells.half[here] if full else None
-            of_term = None if wide else np.einsum("nkr,nkr->nk", piece, piece)
+            of_term = np.einsum("nkr,nkr->nk", piece, piece)
             for g, terms in enumerate(each):
                 if half is not None:
                     halves[g][here] = half[:, terms]
-                if of_term is not None and len(groups[g].terms) == 1:
+                if len(groups[g].terms) == 1:
                     square[g][here] = of_term[:, terms, None]
-                elif of_term is not None:
+                else:
                     alone = piece[:, terms]
                     np.matmul(alone, np.swapaxes(alone, 1, 2), out=square[g][here])
         for g, terms in enumerate(each):
-            yield Tangents(
-                cells.n_local,
-                None if wide else square[g],
-                stack.reshape(n, -1, height) if wide else None,
-                halves[g] if full else None,
-                product[:, terms],
+            half = halves[g] if full else None
+            yield Tangents(cells.n_local, square[g], None, half, product[:, terms])
+
+    def _of_many_terms(self, group: Group, residual: np.ndarray, full: bool) -> Tangents:
+        """Products of the tangents of a group of very many terms; most act in few cells each."""
+        cells, (n, height) = self.arrangement.cells, residual.shape
+        own = self._factors(group)
+        acts = np.stack([pattern.any(axis=(1, 2)) for _, pattern in own])
+        product = np.zeros((n, len(own)))
+        halves = np.zeros((n, len(own), cells.half.shape[2])) if full else None
+        stack = np.zeros((n, len(own), height))
+        for first in range(0, n, MANY_TERMS_CELLS):
+            here = slice(first, min(first + MANY_TERMS_CELLS, n))
+            acting = np.flatnonzero(acts[:, here].any(axis=1))
+            tangents = [own[k][0][here] * own[k][1][here] for k in acting]
+            if not tangents:
+                continue
+            piece = np.stack(tangents, axis=1).reshape(here.stop - first, -1, height)
+            stack[here, acting] = piece
+            product[here, acting] = (piece @ residual[here, :, None])[:, :, 0]
+            if halves is not None:
+                halves[here, acting] = piece @ cells.half[here]
+        return Tangents(cells.n_local, None, stack, halves, product)
+
+    def _factors(self, group: Group) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Of each term of a group the port's derivative [cells, components, width], and what it is
+        multiplied by [cells, 1, width]."""
+        cells, components = self.arrangement.cells, self.arrangement.components
+        shape = len(cells.residual), components, -1
+        return [
+            (
+                cells.tangent[PORT_INDEX[term.port]].reshape(shape),
+                self._pattern(term)[:, None],
             )
+            for term in group.terms
+        ]
 
     def _of_mark(
         self, group: Group, mark: tuple[int, int], residual: np.ndarray, full: bool
