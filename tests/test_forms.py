@@ -251,7 +251,6 @@ EXPECTED = {  # with the constants 2 and 0.5, written without the package
     "aged": X * np.array([0, 1 / 6, 1 / 2, 2 / 3, 1, 2]),  # hours
     "first state": np.exp(-(T - T[0]) / 2),
     "decay": np.exp(-np.maximum(X, 0.0) / 2),
-    "slow decay": np.exp(-np.maximum(X, 0.0) / 0.5),
     "staircase": np.array([-3, -1, 1, 1, 1, 5]),  # steps of 2, half a step off zero
     "rate": np.gradient(X, T / 3600.0),
     "play": np.array([-4, -2.5, -2, -1.3, 0, 2]) - X,  # half way to the lower end at first
@@ -273,7 +272,6 @@ def test_two_lags_read_their_own_constants():
     ahead = BASES["transient"](X, T, constants)
     np.testing.assert_allclose(ahead, X - lag(X, T, 800.0), rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(BASES["lag"](X, T, constants), lag(X, T, 800.0), rtol=1e-13)
-    np.testing.assert_allclose(BASES["slow lag"](X, T, constants), lag(X, T, 4000.0), rtol=1e-13)
 
 
 def test_a_lag_that_began_earlier_is_a_lag_with_a_state_of_its_own():
@@ -290,7 +288,7 @@ def test_a_lag_that_began_earlier_is_a_lag_with_a_state_of_its_own():
 
 
 def test_every_basis_is_checked_here():
-    assert set(EXPECTED) | {"lag", "slow lag", "transient"} == set(BASES)
+    assert set(EXPECTED) | {"lag", "transient"} == set(BASES)
 
 
 @pytest.mark.parametrize("name", BASES)
@@ -315,7 +313,6 @@ slope_in_constants = jax.jit(
     ("name", "constants"),
     [
         ("lag", (300.0, 1.0)),
-        ("slow lag", (300.0, 4000.0)),
         ("onset", (900.0, 1.0)),
         ("log", (900.0, 1.0)),
         ("sine", (2000.0, 1.0)),
@@ -492,11 +489,37 @@ def test_capacity_holds_the_effects_and_the_free_constant():
         assert columns % 4 == constants % 4 == 0
 
 
-def test_forms_name_bases_and_hold_at_most_two_constants():
+def test_forms_that_repeat_a_basis_give_each_a_constant_of_its_own():
+    body, time = (np.asarray(CHANNELS.values[CHANNELS.index(name)]) for name in ("body", "time"))
+
+    def decays(tau):
+        return np.exp(-np.maximum(time, 0.0) / tau)
+
+    known = {
+        ("body", "two lags"): [(800.0, 4000.0), lambda tau: lag(body, CHANNELS.time, tau)],
+        ("time", "two decays"): [(900.0, 300.0), decays],
+        ("time", "3 jumps"): [(3000.0, 1000.0, 5000.0), lambda at: np.where(time >= at, 1.0, 0.0)],
+    }
+    for (driver, form), (constants, course) in known.items():
+        effect = Effect("", (Term("sensor.focal"),), driver, form, constants)
+        table, _, own = tabulate((effect,), CHANNELS, 4, 4)
+        got = np.asarray(courses(table, own, CHANNELS))[: len(constants)]
+        expected = [np.interp(EPOCHS, CHANNELS.time, course(c)) for c in constants]
+        np.testing.assert_allclose(got, expected, rtol=1e-12, atol=1e-12, err_msg=form)
+    assert FORMS["two lags"].labels == ("lag", "slow lag")
+    assert FORMS["two decays"].labels == ("decay", "slow decay")
+    assert FORMS["3 jumps"].labels == ("step", "second step", "third step")
+
+
+def test_forms_name_bases_that_read_at_most_two_constants():
     for name, form in FORMS.items():
         assert form.name == name
         assert all(basis in BASES for basis in form.bases)
-        assert len(form.constants) <= 2
+        read = [form.read_by(k, form.constants) for k in range(len(form.bases))]
+        assert all(len(own) <= 2 for own in read)
+        # None is for nothing, but for an instant that another basis reads along.
+        assert {c.name for own in read for c in own} == {c.name for c in form.constants}
+        assert len(set(form.labels)) == len(form.bases)
 
 
 def test_new_values_leave_the_rest_of_an_effect():

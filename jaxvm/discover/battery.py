@@ -153,11 +153,11 @@ def course_tables(scene: Scene, families: tuple[Family, ...]) -> list[np.ndarray
         for course in family.courses:
             form = FORMS[course.form]
             reference = course.reference if form.centred else 0.0
-            for name in form.bases:
-                key = (course.driver, reference, name, course.constants)
+            for k, name in enumerate(form.bases):
+                own = (*form.read_by(k, course.constants), 1.0, 1.0)[:2]
+                key = (course.driver, reference, name, own)
                 if key not in place:
                     place[key] = len(columns)
-                    own = (*course.constants, 1.0, 1.0)[:2]
                     columns.append((BASIS_INDEX[name], number[course.driver], reference, own))
                 of_family.append(place[key])
         index.append(np.array(of_family).reshape(len(family.courses), family.n_bases))

@@ -130,7 +130,7 @@ class Hypothesis:
     def contains(self, other: "Hypothesis") -> bool:
         """Whether another is a special case of this one at the same place: a parabola's line."""
         terms = set(other.group.terms) <= set(self.group.terms)
-        bases = set(FORMS[other.course.form].bases) <= set(FORMS[self.course.form].bases)
+        bases = set(FORMS[other.course.form].labels) <= set(FORMS[self.course.form].labels)
         driver = self.course.driver == other.course.driver
         return terms and bases and driver and self.scope == other.scope
 

@@ -198,12 +198,13 @@ def tabulate(
         given = effect.amplitudes or (0.0,) * effect.n_columns
         start, driver = column, channels.index(effect.driver)
         for term in effect.terms:
-            for name in form.bases:
+            for k, name in enumerate(form.bases):
+                read = form.read_by(k, own)
                 ports[column, PORT_INDEX[term.port]] = term.weight
                 channel[column] = driver
                 basis[column] = BASIS_INDEX[name]
                 reference[column] = effect.reference if form.centred else 0.0
-                constant_index[column, : len(own)] = own
+                constant_index[column, : len(read)] = read
                 amplitudes[column] = given[column - start]
                 column += 1
         first_constant += len(own)

@@ -5,15 +5,16 @@ one or several bases that share their constants: a periodic effect is a sine and
 period. Everything is written for one course; tables of effects `vmap` over it.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import cast
+from typing import TypeVar, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
+T = TypeVar("T")
 Course = Float[Array, " times"]
 Constants = Float[Array, "2"]
 
@@ -91,7 +92,6 @@ BASES: dict[str, Callable[[Course, Course, Constants], Course]] = {
     "sixth": lambda x, t, c: x**6,
     "lag": lambda x, t, c: first_order_lag(x, t, c[0]),
     "delayed": lambda x, t, c: delayed(x, t, c[0]),
-    "slow lag": lambda x, t, c: first_order_lag(x, t, c[1]),
     "first state": lambda x, t, c: jnp.exp(-(t - t[0]) / c[0]),
     "rate": lambda x, t, c: rate(x, t),
     "aged": lambda x, t, c: x * (t - t[0]) / 3600.0,
@@ -102,7 +102,6 @@ BASES: dict[str, Callable[[Course, Course, Constants], Course]] = {
     "step": lambda x, t, c: jnp.where(x >= c[0], 1.0, 0.0),
     "ramp": lambda x, t, c: jnp.maximum(x - c[0], 0.0),
     "decay": lambda x, t, c: jnp.exp(-jnp.maximum(x, 0.0) / c[0]),
-    "slow decay": lambda x, t, c: jnp.exp(-jnp.maximum(x, 0.0) / c[1]),
     "staircase": lambda x, t, c: c[0] * (jnp.round(x / c[0] - c[1]) + c[1]),
     "doubling": lambda x, t, c: jnp.exp2(jnp.clip(x / c[0], -30.0, 30.0)),
     "turned": lambda x, t, c: x * jnp.cos(2.0 * jnp.pi * (t - t[0]) / c[0]),
@@ -174,9 +173,30 @@ class Form:
     words: str
     centred: bool = False
     """Whether the driver is counted from its reference value (its mean over the recording)."""
+    reads: tuple[int, ...] = ()
+    """Of each basis the first constant that it reads; by default that of the form."""
+
+    def read_by(self, basis: int, constants: Sequence[T]) -> Sequence[T]:
+        """Those constants of the form, one or two, that one of its bases reads."""
+        first = self.reads[basis] if self.reads else 0
+        return constants[first : first + 2]
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of the bases; one that occurs again is told by its constant: "slow lag"."""
+        firsts = self.reads or (0,) * len(self.bases)
+        again = (f"{self.constants[k].name.split()[0]} " if k else "" for k in firsts)
+        return tuple(own + basis for own, basis in zip(again, self.bases, strict=True))
 
 
 _TAU = Constant("time constant", "s")
+_INSTANTS = tuple(
+    Constant(name, "s", refined=False)
+    for name in ("instant", "second instant", "third instant", "fourth instant")
+)
+
+JUMPS = {n: f"{n} jumps" for n in range(2, len(_INSTANTS) + 1)}
+"""Forms of what stands still between several jumps, by their number."""
 
 FORMS: dict[str, Form] = {
     form.name: form
@@ -222,10 +242,11 @@ FORMS: dict[str, Form] = {
         Form("first state", ("first state",), (_TAU,), "fading from where it was at first"),
         Form(
             "two lags",
-            ("lag", "slow lag"),
+            ("lag", "lag"),
             (_TAU, Constant("slow time constant", "s")),
             "following {driver} with two time constants",
             centred=True,
+            reads=(0, 1),
         ),
         Form("proportional", ("linear",), (), "in proportion to {driver} itself"),
         Form("square", ("square",), (), "in proportion to the square of {driver} itself"),
@@ -273,9 +294,10 @@ FORMS: dict[str, Form] = {
         Form("fading", ("decay",), (_TAU,), "fading exponentially with {driver}"),
         Form(
             "two decays",
-            ("decay", "slow decay"),
+            ("decay", "decay"),
             (_TAU, Constant("slow time constant", "s")),
             "fading with two time constants of {driver}",
+            reads=(0, 1),
         ),
         Form(
             "doubling",
@@ -299,8 +321,16 @@ FORMS: dict[str, Form] = {
             centred=True,
         ),
         Form("creep", ("log",), (_TAU,), "creeping with the logarithm of {driver}"),
-        Form(
-            "step", ("step",), (Constant("instant", "s", refined=False),), "suddenly, in {driver}"
+        Form("step", ("step",), _INSTANTS[:1], "suddenly, in {driver}"),
+        *(
+            Form(
+                name,
+                n * ("step",),
+                _INSTANTS[:n],
+                f"suddenly, {n} times in {{driver}}",
+                reads=tuple(range(n)),
+            )
+            for n, name in JUMPS.items()
         ),
         Form(
             "settling",

@@ -31,7 +31,6 @@ SIGNAL_WHEN = "in every image anew, alike for neighbouring marks"
 _PER_DRIVER = {
     "linear": 1,
     "lag": 1,
-    "slow lag": 1,
     "delayed": 1,
     "play": 1,
     "square": 2,
@@ -65,7 +64,7 @@ def parameters(effect: Effect, stds: tuple[float, ...]) -> list[Parameter]:
     stds = stds or (float("nan"),) * (effect.n_columns + len(effect.constants))
     found, column = [], 0
     for term in effect.terms:
-        for basis in form.bases:
+        for basis, label in zip(form.bases, form.labels, strict=True):
             name = term.port
             if term.driver != "one":
                 name += f" ~ {term.driver}"
@@ -74,7 +73,7 @@ def parameters(effect: Effect, stds: tuple[float, ...]) -> list[Parameter]:
                 if term.basis == "bump":
                     name += f" at {term.constants[0]:.2f}"
             if len(form.bases) > 1:
-                name += f", {basis}"
+                name += f", {label}"
             per = _PER_DRIVER.get(basis, 0) if effect.driver != "constant" else 0
             unit = _per(_PORT[term.port].unit, driver_unit(effect.driver), per, basis == "rate")
             found.append(Parameter(name, effect.amplitudes[column], stds[column], unit))
