@@ -7,7 +7,7 @@ import pytest
 from networks import board_recording, predicted
 
 from jaxvm.discover import courses
-from jaxvm.discover.constants import constants_held, other_instants, run_away
+from jaxvm.discover.constants import constants_held, jumps_of, other_instants, run_away
 from jaxvm.discover.courses import gaps
 from jaxvm.discover.diagnose import _plain_fit
 from jaxvm.discover.finer import at_finer_constants, best_of, said, scores_about
@@ -57,7 +57,7 @@ def test_the_gap_is_found_between_points_of_the_grid(recorded, monkeypatch):
     step = next(item for item in leading if item[0].course.form == "step")
     finer = scores_about(tests, ranking, step[0], variance)
     assert finer is not None
-    best = best_of(finer, step[0], tests)
+    best = best_of(finer.scores[0], step[0], tests)
     assert best is not None
     hypothesis, drop, amplitudes = best
     pause = np.median(np.diff(gaps("time", scene.network.channels)))
@@ -92,12 +92,27 @@ def test_other_instants_cross_epochs_that_were_not_fitted(recorded):
     scene, instant = recorded
     scene = scene.with_effects((slipped(instant),), (8, 4))
     fitted = np.ones(N_EPOCHS, bool)
-    assert not list(other_instants(scene, fitted))
+    (jump,) = jumps_of(scene)
+    assert not list(other_instants(scene, jump, fitted))
     fitted[50] = False
-    (later,) = other_instants(scene, fitted)
+    (later,) = other_instants(scene, jump, fitted)
     assert later.effects[0].constants[0] > instant
     fitted[49] = False
-    assert len(list(other_instants(scene, fitted))) == 2
+    assert len(list(other_instants(scene, jump, fitted))) == 2
+
+
+def test_every_jump_has_other_sides_of_its_own(recorded):
+    scene, instant = recorded
+    twice = replace(
+        slipped(instant), form="2 jumps", constants=(50.0, instant), amplitudes=4 * (0,)
+    )
+    scene = scene.with_effects((slipped(100.0), twice), (8, 4))
+    assert jumps_of(scene) == [(0, 0), (1, 0), (1, 1)]
+    fitted = np.arange(N_EPOCHS) != 50
+    assert not list(other_instants(scene, (1, 0), fitted))
+    (later,) = other_instants(scene, (1, 1), fitted)
+    assert later.effects[1].constants[0] == 50.0 and later.effects[1].constants[1] > instant
+    assert later.effects[0] == scene.effects[0]
 
 
 def test_constants_that_run_away_are_seen(recorded):

@@ -80,11 +80,10 @@ def test_intervals_of_weak_slips_hold_the_truth(board):
             board, slipped(truth, 6e-5), slipped(float(middles[13]), 6e-5), seed
         )
         final, (instants,) = at_best_instants(final, [found], 0, weights)
-        assert instants is not None
         value, std = instant_of(final, found, instants)
-        assert value == instants.best
+        assert value == instants[0].best
         z.append((value - truth) / std)
-        narrow += abs(value - truth) > 1.645 * instants.gap(value) / 3.5
+        narrow += abs(value - truth) > 1.645 * instants[0].gap(value) / 3.5
     inside = np.sum(np.abs(z) <= 1.645)
     # 90 % of 40, within three standard deviations; half a gap alone would not do.
     assert inside >= 30, z
@@ -105,7 +104,6 @@ def test_a_mark_that_was_not_seen_leaves_the_instant_open(board):
     stds = []
     for final, weights, found in (seen, unseen):
         instants = instants_of(final, 0, found, weights)
-        assert instants is not None
         stds.append(instant_of(final, found, instants)[1])
     gap = float(np.median(np.diff(middles)))
     # A uniform distribution over one gap, and over ten of them.
@@ -128,11 +126,34 @@ def test_a_start_that_is_refined_keeps_the_tangent_inside_its_gap(board):
     assert std > 2.0 * gap
 
 
+def test_of_several_jumps_each_goes_where_all_epochs_want_it(board):
+    middles = gaps("time", board[0].true_scene().network.channels)
+    gap = float(np.median(np.diff(middles)))
+    truth = Effect("", TERMS, "time", "3 jumps", tuple(middles[[4, 12, 20]]), 0.0, MARK)
+    sizes = (2e-3, -2e-4, 1e-3, -1e-3, 1e-4, 2e-3)  # x at each, then y at each
+    start = replace(truth, constants=tuple(middles[[5, 13, 20]]), amplitudes=6 * (1e-4,))
+    final, weights, found = fitted(board, replace(truth, amplitudes=sizes), start)
+    final, (instants,) = at_best_instants(final, [found], 0, weights)
+    (effect,) = final.scene.fitted_effects()
+    shown = with_spread(
+        replace(found, final_effect=effect, final_stds=(*found.final_stds, 0.0, 0.0, 0.0)[:9]),
+        instants,
+    )
+    stds = np.array(shown.final_stds[6:])
+    assert effect.constants[0] == middles[4]
+    assert effect.constants[2] == middles[20]
+    # What is strong is known to its gap, the weak one is not.
+    np.testing.assert_allclose(stds[[0, 2]], gap / np.sqrt(12.0), rtol=1e-3)
+    assert stds[1] > 1.5 * stds[0]
+    assert abs(effect.constants[1] - middles[12]) < 3.0 * stds[1]
+    assert "suddenly, 3 times in time (instant" in when(effect)
+
+
 def test_what_has_no_instant_is_left_alone(board):
     steady = Effect("it sits wrongly", TERMS, "constant", "constant", (), 0.0, MARK, (1e-3, 0.0))
     final, weights, found = fitted(board, steady, steady)
-    assert instants_of(final, 0, found, weights) is None
-    assert with_spread(found, None) is found
+    assert instants_of(final, 0, found, weights) == ()
+    assert with_spread(found, ()) == found
 
 
 def test_words_tell_how_sure_an_instant_is():

@@ -8,7 +8,7 @@ import numpy as np
 from jaxvm.discover.courses import at_epochs
 from jaxvm.network.scene import Scene
 from jaxvm.physics.effects import Effect
-from jaxvm.physics.forms import FORMS
+from jaxvm.physics.forms import FORMS, JUMPS
 
 
 def constants_held(scene: Scene, since: int = 0) -> np.ndarray:
@@ -43,25 +43,34 @@ def sensible(scene: Scene, effect: Effect) -> bool:
     return True
 
 
-def other_instants(scene: Scene, fitted: np.ndarray) -> Iterator[Scene]:
-    """Scenes with one step on the other side of an epoch beside it that was not fitted.
+def jumps_of(scene: Scene) -> list[tuple[int, int]]:
+    """Every jump of the effects of a scene: number of the effect, and of its instant."""
+    jumping = ("step", *JUMPS.values())
+    return [
+        (number, k)
+        for number, effect in enumerate(scene.effects)
+        for k in range(len(effect.constants) if effect.form in jumping else 0)
+    ]
 
-    The fitted epochs leave open on which side of the step such an epoch lies.
+
+def other_instants(scene: Scene, jump: tuple[int, int], fitted: np.ndarray) -> Iterator[Scene]:
+    """Scenes with a jump on the other side of an epoch beside it that was not fitted.
+
+    The fitted epochs leave open on which side of the jump such an epoch lies.
 
     Args:
         scene: a fitted scene.
+        jump: number of the effect, and of its instant (`jumps_of`).
         fitted: for each epoch whether it was fitted.
     """
-    for k, effect in enumerate(scene.effects):
-        if effect.form != "step":
-            continue
-        at = at_epochs(effect.driver, scene.network.channels)
-        order = np.argsort(at)
-        at, sure = at[order], fitted[order]
-        first = int(np.searchsorted(at, effect.constants[0]))
-        for beside, gap in ((first - 1, first - 1), (first, first + 1)):
-            if 0 < gap < len(at) and not sure[beside]:
-                effects = list(scene.fitted_effects())
-                instant = float(0.5 * (at[gap - 1] + at[gap]))
-                effects[k] = replace(effects[k], constants=(instant,))
-                yield scene.with_effects(tuple(effects), scene.room)
+    (number, k), effects = jump, list(scene.fitted_effects())
+    instants = list(effects[number].constants)
+    at = at_epochs(effects[number].driver, scene.network.channels)
+    order = np.argsort(at)
+    at, sure = at[order], fitted[order]
+    first = int(np.searchsorted(at, instants[k]))
+    for beside, gap in ((first - 1, first - 1), (first, first + 1)):
+        if 0 < gap < len(at) and not sure[beside]:
+            instants[k] = float(0.5 * (at[gap - 1] + at[gap]))
+            effects[number] = replace(effects[number], constants=tuple(instants))
+            yield scene.with_effects(tuple(effects), scene.room)

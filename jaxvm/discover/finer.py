@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxvm.discover.courses import ENDS, Course, gaps
 from jaxvm.discover.hypotheses import Family, Hypothesis
-from jaxvm.discover.ranking import Ranking, where
+from jaxvm.discover.ranking import Ranking, Scores, where
 from jaxvm.discover.score import ScoreTests
 from jaxvm.discover.select import SOUGHT, evidence
 from jaxvm.discover.space import member
@@ -47,7 +47,7 @@ def at_finer_constants(
     variance = ranking.scores[0].variance
     for hypothesis, own, amplitudes in leading:
         about = scores_about(tests, ranking, hypothesis, variance)
-        best = None if about is None else best_of(about, hypothesis, tests)
+        best = None if about is None else best_of(about.scores[0], hypothesis, tests)
         better = -np.inf if best is None else evidence(*best, variance, n)
         # What is equal stays for its scores: they tell how wide the best one is.
         if best is not None and better >= own:
@@ -89,7 +89,7 @@ def scores_about(
         finer = _FINER[course.form](course, grid, scene.network.channels)
         if not finer:
             return None
-        return tests.about((_of_courses(family, (g, own[0], s), finer),)).score(variance)
+        return tests.about((of_courses(family, (g, own[0], s), finer),)).score(variance)
     return None
 
 
@@ -131,7 +131,7 @@ def _neighbours(grid: np.ndarray, value: float, reach: int) -> tuple[float, floa
     return float(grid[max(at - reach, 0)]), float(grid[min(at + reach, len(grid) - 1)])
 
 
-def _of_courses(family: Family, index: tuple[int, int, int], courses: tuple[Course, ...]) -> Family:
+def of_courses(family: Family, index: tuple[int, int, int], courses: tuple[Course, ...]) -> Family:
     """Given courses in place of all others, for one group in one scope."""
     g, c, s = index
     valid = np.zeros((1, len(courses), len(family.scopes)), bool)
@@ -147,10 +147,9 @@ def _of_courses(family: Family, index: tuple[int, int, int], courses: tuple[Cour
 
 
 def best_of(
-    finer: Ranking, hypothesis: Hypothesis, tests: ScoreTests
+    scores: Scores, hypothesis: Hypothesis, tests: ScoreTests
 ) -> tuple[Hypothesis, float, np.ndarray] | None:
-    """The hypothesis at the best finer constants: (hypothesis, drop, one-step amplitudes)."""
-    (scores,) = finer.scores
+    """A hypothesis with the best of some courses: (hypothesis, drop, one-step amplitudes)."""
     drop = np.where(scores.valid, scores.drop, -np.inf)
     if not np.isfinite(drop.max()):
         return None

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jaxvm.discover.constants import constants_held, other_instants, run_away
+from jaxvm.discover.constants import constants_held, jumps_of, other_instants, run_away
 from jaxvm.network.scene import Scene
 from jaxvm.solve.adjust import Adjustment, adjust, reference_sigma
 
@@ -209,9 +209,10 @@ def evaluate(scene: Scene, held: np.ndarray, sound: tuple[np.ndarray, ...]) -> H
     the side that suits it, as it takes its own poses.
     """
     shown = _evaluate(scene, held, sound)
-    for other in other_instants(shown.scene, ~held):
-        tried = _evaluate(other, held, sound)
-        shown = tried if tried.total < shown.total else shown
+    for place in jumps_of(scene):
+        for other in other_instants(shown.scene, place, ~held):
+            tried = _evaluate(other, held, sound)
+            shown = tried if tried.total < shown.total else shown
     return shown
 
 

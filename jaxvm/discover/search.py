@@ -11,6 +11,7 @@ from jaxvm.discover.diagnosis import Finding
 from jaxvm.discover.doubt import doubted
 from jaxvm.discover.finer import at_finer_constants, said, with_slow_beginnings
 from jaxvm.discover.heldout import HeldOut, Split, gain
+from jaxvm.discover.jumps import with_jumps
 from jaxvm.discover.naming import WORSE, Naming
 from jaxvm.discover.noise import Correlation, Met, met, random_signs
 from jaxvm.discover.pairs import better_pair, other_beginnings, worth_a_second_thought
@@ -109,6 +110,8 @@ class Search:
                 leading, self._tests, self.ranking, self.parts.n
             )
             leading = with_slow_beginnings(leading, self.ranking, self.current.scene)
+            if self.p_value <= self.alpha:
+                leading = with_jumps(leading, self._tests, self.ranking, self.parts.n)
             accepted = self._accepted(leading, progress)
             if accepted is None:
                 # What no course explains may be a wave, or differ from image to image.

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from jaxvm.physics.effects import Term
+from jaxvm.physics.forms import JUMPS
 
 Terms = tuple[Term, ...]
 
@@ -44,8 +45,12 @@ class Entry:
     explanation: str
 
     def takes(self, kinds: tuple[str, ...], form: str) -> bool:
-        """Whether a driver of any of these kinds may drive it in a form."""
-        return form in self.forms and any(kind in self.drivers for kind in kinds)
+        """Whether a driver of any of these kinds may drive it in a form.
+
+        What jumps may jump again.
+        """
+        known = form in self.forms or ("step" in self.forms and form in JUMPS.values())
+        return known and any(kind in self.drivers for kind in kinds)
 
 
 HYSTERESIS = ("hysteresis", "hysteresis with state")
