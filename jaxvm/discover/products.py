@@ -63,6 +63,8 @@ class Tangents:
                 here = slice(first, first + MANY_TERMS_CELLS)
                 piece = np.swapaxes(self.stack[cells[here]], 0, 1)  # k n rows
                 acting = np.flatnonzero(piece.any(axis=(1, 2)))
+                if not len(acting):
+                    continue
                 piece = piece[acting]
                 place = (acting[:, None] * n_bases + np.arange(n_bases)).ravel()
                 for own, course in zip(gram, weights[:, :, here], strict=True):
