@@ -16,6 +16,7 @@ from jaxvm.discover.select import best_named, evidence, identity, log_prior, ref
 from jaxvm.physics.catalogue import entries_for
 from jaxvm.physics.catalogue.entry import each
 from jaxvm.physics.effects import Effect, Scope, Term
+from jaxvm.solve.adjust import adjust
 
 FOCAL = (Term("sensor.focal"),)
 DRIFT = Hypothesis(
@@ -150,3 +151,29 @@ def test_depths_of_marks_do_not_run_away_with_the_poses():
 
     np.testing.assert_allclose(beside_the_pose(found.amplitudes), beside_the_pose(true), atol=2e-4)
     assert np.abs(found.amplitudes).max() < 1.5 * np.abs(true).max()
+
+
+def test_a_refit_goes_on_until_the_camera_has_made_room():
+    # A tilted sensor, where centre and decentring are free: they go dozens of pixels with it.
+    known = board_recording(n_epochs=30)
+    obs, rng = known.recording.observations, np.random.default_rng(4)
+    camera = Scope(camera=("cam",))
+    terms = (Term("lens.tilt_y"),)
+    tilted = Effect("", terms, "constant", "constant", (), 0.0, camera, (0.15,))
+    pixel = predicted(known.true_scene().with_effects((tilted,), (8, 4)))
+    pixel += obs.sigma[:, None] * rng.standard_normal(pixel.shape)
+    recording = replace(known.recording, observations=replace(obs, pixel=pixel))
+    parts, plain, _ = _plain_fit(known.true_scene(recording), 3)
+    names = entries_for(terms, "camera", ("constant",), "constant")
+    course = Course("constant", "constant")
+    hypothesis = Hypothesis(Group(terms, "camera"), course, camera, names)
+    candidate = refit(plain, hypothesis, np.array([0.1]), parts)
+    assert candidate is not None
+    best = adjust(
+        candidate.adjustment.scene, weights=parts.weights, rtol=1e-13, max_steps=200, check=False
+    )
+    drop, most = (2.0 * (plain.cost - fit.cost) for fit in (candidate.adjustment, best))
+    assert most > 100.0
+    assert drop > most - 1.0
+    (size,) = candidate.amplitudes
+    assert abs(size - 0.15) < 0.03

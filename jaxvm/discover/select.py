@@ -39,7 +39,7 @@ CLEAR = 15.0
 SOUGHT = ("step", "staircase", "hysteresis", "hysteresis with state")
 """Forms that are asked at few constants and gain most by better ones: no tangent leads there."""
 
-_RTOL, _MAX_STEPS = 1e-6, 10
+_RTOL, _MAX_STEPS, _MAX_STEPS_WIDE = 1e-6, 40, 10
 
 _WIDE = 3.0
 """Prior standard deviation of the amplitudes of a free form, over their median size."""
@@ -214,7 +214,7 @@ def refit(base: Adjustment, hypothesis: Hypothesis, amplitudes, split: Split) ->
             active=None if freed else constants_held(scene, since=len(effects) - 1),
             rtol=_RTOL,
             damping=1e-6,
-            max_steps=_MAX_STEPS,
+            max_steps=_MAX_STEPS_WIDE if len(amplitudes) > FREE else _MAX_STEPS,
             check=False,
         )
 

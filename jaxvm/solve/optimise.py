@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxvm.compiling import program
 from jaxvm.solve.arrow import NormalCholesky
-from jaxvm.solve.problem import Normal, normal_at
+from jaxvm.solve.problem import Normal, Problem, normal_at
 
 _HISTORY = 512
 
@@ -26,6 +26,16 @@ _MOST_CUTS = 2
 
 _GRANTED, _SLOWEST = 3.0, 0.9
 """What a minimisation may gain beyond what its steps promise, and the slowest rate it is given."""
+
+
+_CURVED = 2
+"""Trials worse than foretold from which on a minimisation follows the curve of its valley."""
+
+_MOST_BENT = 0.375
+"""Length of the correction for curvature, in lengths of the step, from which it is not trusted.
+
+Transtrum and Sethna (2012): twice the second-order correction at most 0.75 of the step.
+"""
 
 
 class HasNormal(Protocol):
@@ -192,9 +202,39 @@ def minimise(
     info = _as_info(normal)
     y, state = _begin(solver, info)
     y, state = _advance(solver, y, state, info)
+    doubts = 0
     while not (bool(state.done) or (np.isfinite(wanted) and _out_of_reach(state, wanted))):
+        before = state
         y, state = _advance(solver, y, state, _as_info(problem.normal(state.trial)))
+        if isinstance(problem, Problem) and isinstance(solver.search, Relaxing):
+            doubts += not _trusts_more(before, state)
+            if doubts >= _CURVED and not bool(state.done):
+                state = _bent(solver, y, state, problem.bend(y, state.trial - y))
     return y, state
+
+
+def _trusts_more(before: _State, after: _State) -> bool:
+    """Whether the last trial was as good as the normal equations had foretold."""
+    return bool(after.search.step_size > before.search.step_size)
+
+
+@program
+def _bent(solver: NormalEquationSolver, y, state: _State, bend: Float[Array, " n"]) -> _State:
+    """The state with a trial that follows the curve of the valley, where it is a gentle one.
+
+    The residuals along a step v are r + J v + r'' / 2; what the bend r'' adds is taken off by the
+    same damped normal equations (geodesic acceleration; Transtrum, Machta and Sethna, 2011). A
+    straight step in a curved, narrow valley (a tilted sensor beside a centre that is free) is
+    rejected again and again until it is short.
+    """
+    info = eqx.tree_at(lambda info: info.grad, state.info, bend)
+    descent = solver.descent.query(y, info, state.descent)
+    correction, result = solver.descent.step(state.search.step_size, descent)
+    correction = 0.5 * correction
+    gentle = jnp.linalg.norm(correction) <= _MOST_BENT * jnp.linalg.norm(state.trial - y)
+    taken = gentle & (result == optx.RESULTS.successful)
+    trial = jnp.where(taken, state.trial + correction, state.trial)
+    return eqx.tree_at(lambda state: state.trial, state, trial)
 
 
 def _out_of_reach(state: _State, wanted: float) -> bool:
