@@ -1,12 +1,12 @@
 """The held-out epochs' word: the odds of two forecasts, each with its own uncertainty."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from networks import board_recording, predicted
+from networks import board_recording, predicted, stereo_recording
 
 from jaxvm.discover.accept import STRONG, _is_determined, accept
 from jaxvm.discover.courses import Course
@@ -16,7 +16,9 @@ from jaxvm.discover.heldout import gain, weights_of
 from jaxvm.discover.hypotheses import Hypothesis
 from jaxvm.discover.select import refit
 from jaxvm.physics.catalogue import entries_for
+from jaxvm.physics.catalogue.entry import each
 from jaxvm.physics.effects import Effect, Scope, Term
+from jaxvm.solve.covariance import effect_deviations
 from jaxvm.solve.problem import scene_problem
 
 FOCAL = (Term("sensor.focal"),)
@@ -134,6 +136,27 @@ def test_what_no_epoch_shows_has_no_size(known):
     for candidate, determined in ((found, True), (replace(found, adjustment=unseen), False)):
         shown = parts.evaluate(candidate.adjustment.scene)
         assert _is_determined(candidate, shown) is determined
+
+
+def test_an_image_that_was_never_taken_needs_no_amount():
+    known = stereo_recording()
+    obs, cameras = known.recording.observations, known.recording.model.cameras
+    left = next(k for k, camera in enumerate(cameras) if camera.name == "left")
+    seen = ~((obs.camera == left) & (obs.epoch == 3))
+    obs = replace(obs, **{f.name: getattr(obs, f.name)[seen] for f in fields(obs)})
+    scene = known.true_scene(replace(known.recording, observations=obs))
+    parts, plain, _ = _plain_fit(scene, 3)
+    assert not parts.held[3]
+    terms = each("epoch", "sensor.cx", "sensor.cy", numbers=range(6))
+    camera, course = Scope(camera=("left",)), Course("constant", "constant")
+    hypothesis = Hypothesis(Group(terms, "camera"), course, camera, ())
+    candidate = refit(plain, hypothesis, np.zeros(len(terms)), parts)
+    assert candidate is not None
+    shown = parts.evaluate(candidate.adjustment.scene)
+    completed = replace(candidate.adjustment, scene=shown.scene)
+    sized = np.isfinite(effect_deviations(completed)[-1])
+    assert sized.sum() == len(terms) - 2
+    assert _is_determined(candidate, shown)
 
 
 def drawn_odds(known, per_second, seed):

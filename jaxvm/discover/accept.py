@@ -8,6 +8,8 @@ import numpy as np
 from jaxvm.discover.heldout import Gain, HeldOut, Split, gain
 from jaxvm.discover.hypotheses import FREE, Hypothesis
 from jaxvm.discover.select import Candidate, identity, refit
+from jaxvm.physics.catalogue.entry import EACH
+from jaxvm.physics.forms import FORMS
 from jaxvm.solve.adjust import Adjustment
 from jaxvm.solve.covariance import effect_deviations
 
@@ -115,9 +117,16 @@ def accept(
 
 
 def _is_determined(candidate: Candidate, shown: HeldOut) -> bool:
-    """Whether the fit, completed by the held-out epochs, has a size for what it added."""
+    """Whether the fit, completed by the held-out epochs, has a size for what it added.
+
+    An image or a mark that was never seen has no amount of its own, and needs none.
+    """
     completed = replace(candidate.adjustment, scene=shown.scene)
-    return bool(np.isfinite(effect_deviations(completed)[-1]).all())
+    sized = np.isfinite(effect_deviations(completed)[-1])
+    bases = len(FORMS[candidate.effect.form].bases)
+    of_all = [t.driver not in EACH for t in candidate.effect.terms for _ in range(bases)]
+    needed = np.append(of_all, np.ones(len(sized) - len(of_all))).astype(bool)
+    return bool(sized.any() and sized[needed].all())
 
 
 def _least(hypothesis: Hypothesis) -> float:
