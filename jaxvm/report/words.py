@@ -219,17 +219,22 @@ def separate_by(finding: Finding) -> str:
 
 
 def odds(value: float) -> str:
-    """Odds to one, not more than a million."""
-    return f"{value:.1f}:1" if value < 10.0 else f"{min(value, 1e6):,.0f}:1"
+    """Odds to one, to a million."""
+    if value > 1e6:
+        return "over 1,000,000:1"
+    return f"{value:.1f}:1" if value < 10.0 else f"{value:,.0f}:1"
 
 
 def proof(gain: Gain) -> str:
-    """What the held-out epochs say: their errors and, where these don't tell, their odds."""
+    """What the held-out epochs say: their errors and, where these hardly tell, how likely they are
+    smaller, and their odds."""
     low, high = (100.0 * bound for bound in gain.interval)
     words = (
         f"held-out {gain.before_px:.4f} px -> {gain.after_px:.4f} px "
         f"({low:.1f} to {high:.1f} % of chi-square, 95 %)"
     )
+    if gain.interval[0] <= 0.0:
+        words += f"; smaller with a probability of {gain.probability:.0%}"
     if gain.odds > 0.0:
         words += f"; odds of the two forecasts {odds(math.exp(0.5 * min(gain.odds, 100.0)))}"
     return words
