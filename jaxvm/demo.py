@@ -63,7 +63,8 @@ def paragraph(shown: Demonstration, page: Path) -> str:
         hidden = "Nothing was hidden in the recording."
     if diagnosis.findings:
         named = "; ".join(
-            f"{f.effect.name} ({f.effect.scope.words()}, {when(f.effect)}): {size(f)}"
+            f"{f.effect.name} ({f.effect.scope.words()}, {when(f.final_effect)}): "
+            f"{size(f, final=True)}"
             for f in diagnosis.findings
         )
         found = f"The diagnosis, which saw only the recording, found: {named}."

@@ -209,7 +209,7 @@ def separate_by(finding: Finding) -> str:
     entries = finding.hypothesis.entries
     other = entries[0].separate_by if entries else "another driver's range, another geometry"
     if not finding.advice:
-        return other
+        return f"{other} (by the catalogue; no further recording was weighed)"
     best = finding.advice[0]
     rival = best.rivals[int(np.argmin(best.chances))].effect(()).name
     if best.chance < _HOPELESS:
@@ -351,15 +351,15 @@ def summary(diagnosis: Diagnosis) -> str:
             f"   where     {effect.scope.words()}",
             f"   when      {when(finding.final_effect, finding.final_stds)}"
             + (f": it {shape}" if shape else ""),
-            f"   size      {size(finding)}",
+            f"   size      {size(finding, final=True)}",
             f"   explains  {100 * finding.share:.0f} % of the excess chi-square, "
             f"{in_pixels(finding):.3f} px RMS; p = {finding.p_value:.2g}, family-wise, "
             f"of {finding.n_hypotheses:,} hypotheses",
             f"   proof     {proof(gain)}",
         ]
         if finding.rivals:
-            alike = "; ".join(doubles(finding))
-            lines.append(f"   or        {alike}  [weight of the above {finding.weight:.2f}]")
+            lines.append(f"   weight    {finding.weight:.2f}; this recording can't tell it at 20:1 from")
+            lines += [f"             {words}" for words in doubles(finding)]
             lines.append(f"   separate  {separate_by(finding)}")
         if nearly_as_good(finding):
             lines.append(f"   nearly    {nearly_as_good(finding)}  [fitted a little worse]")
