@@ -350,6 +350,22 @@ def test_extrapolation_is_flagged(identified):
     assert not compensate(a_recording(DRIFT), identified.model).outside.any()
 
 
+def test_another_camera_of_the_same_name_is_told(identified):
+    recording = a_recording(DRIFT)
+    (camera,) = recording.model.cameras
+    (drift,) = identified.model.cameras
+    assert drift.focal_px == pytest.approx(np.mean(camera.focal_px), rel=1e-3)
+    assert not any(
+        "same camera" in text for text in compensate(recording, identified.model).warnings
+    )
+    longer = replace(camera, focal_px=1.01 * camera.focal_px)
+    other = replace(recording, model=replace(recording.model, cameras=(longer,)))
+    assert any("same camera" in text for text in compensate(other, identified.model).warnings)
+    # A model of an earlier version does not tell.
+    silent = DriftModel((replace(drift, focal_px=0.0),))
+    assert not any("same camera" in text for text in compensate(other, silent).warnings)
+
+
 def test_trajectories_are_the_changes_that_were_made():
     """Against the truth of the simulation, in the deviations that theory gives."""
     a, b = (trajectories(adjust(build(a_recording(DRIFT, noise=n), ())), "left") for n in (0, 1))

@@ -23,6 +23,12 @@ from jaxvm.physics.ports import N_PORTS, PORT_INDEX, PortValues
 from jaxvm.recording import Recording
 from jaxvm.recording.model import Camera
 
+_SAME_CAMERA = 2e-3
+"""Relative difference of focal lengths from which it is another camera, or another focus.
+
+Temperature changes them by some 1e-4, calibrations differ by as much.
+"""
+
 
 @dataclass(frozen=True, eq=False)
 class Compensated:
@@ -87,6 +93,13 @@ def compensate(
         if drift is None:
             warnings.append(f'the model has no camera "{camera.name}"; its pixels stay as they are')
             continue
+        if camera.focal_px is not None and drift.focal_px > 0.0:
+            focal = float(np.mean(camera.focal_px))
+            if abs(focal / drift.focal_px - 1.0) > _SAME_CAMERA:
+                warnings.append(
+                    f"camera {camera.name} has a focal length of {focal:.1f} px, the one that the "
+                    f"model was identified on {drift.focal_px:.1f} px: is it the same camera?"
+                )
         own = np.flatnonzero(obs.camera == number)
         ports = drift.dynamics.response(inputs)[obs.epoch[own]]
         if depth is None and drift.has_shifts:

@@ -258,6 +258,7 @@ def _identified(plain, courses: Trajectories, inputs: Inputs, structures, progre
     drift = CameraDrift(
         courses.camera, courses.ports, courses.held, dynamics, _depth(plain, courses.camera),
         trained, float(px * np.sqrt(excess)), float(px * np.sqrt(moved)),
+        _focal(plain, courses.camera),
     )  # fmt: skip
     return Identified(drift, courses, best, candidates, tuple(_warnings(best, inputs, courses)))
 
@@ -289,6 +290,12 @@ def _depth(plain: Adjustment, camera: str) -> float:
     obs = plain.scene.recording.observations
     own = obs.camera == [c.name for c in plain.scene.model.cameras].index(camera)
     return float(np.mean(depths(plain.scene)[own]))
+
+
+def _focal(plain: Adjustment, camera: str) -> float:
+    """Mean focal length (px) of a camera."""
+    number = [c.name for c in plain.scene.model.cameras].index(camera)
+    return float(np.mean(plain.scene.state.focal[number]))
 
 
 def _warnings(best: Fit, inputs: Inputs, courses: Trajectories) -> list[str]:

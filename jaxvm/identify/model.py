@@ -42,6 +42,7 @@ class CameraDrift:
         trained: what every input did.
         held_out_px: error (px RMS of a mark) of the blocks that were not fitted, noise taken off.
         drift_px: drift (px RMS of a mark) of the training, noise taken off.
+        focal_px: mean focal length of the camera it was identified on (px); 0 where unknown.
     """
 
     camera: str
@@ -52,6 +53,7 @@ class CameraDrift:
     trained: dict[str, Trained]
     held_out_px: float
     drift_px: float
+    focal_px: float = 0.0
 
     @property
     def has_shifts(self) -> bool:
@@ -127,6 +129,7 @@ def _table(own: CameraDrift) -> dict[str, Any]:
         "depth_m": float(own.depth_m),
         "held_out_px": float(own.held_out_px),
         "drift_px": float(own.drift_px),
+        "focal_px": float(own.focal_px),
         "held": list(own.held),
         "dynamics": dynamics,
         "trained": {name: asdict(t) for name, t in own.trained.items()},
@@ -196,5 +199,5 @@ def _camera(name: str, table: dict[str, Any]) -> CameraDrift:
     return CameraDrift(
         name, tuple(ports), tuple(table["held"]), dynamics, float(table["depth_m"]),
         {key: Trained(float(t["low"]), float(t["high"])) for key, t in table["trained"].items()},
-        float(table["held_out_px"]), float(table["drift_px"]),
+        float(table["held_out_px"]), float(table["drift_px"]), float(table.get("focal_px", 0.0)),
     )  # fmt: skip

@@ -358,7 +358,9 @@ def summary(diagnosis: Diagnosis) -> str:
             f"   proof     {proof(gain)}",
         ]
         if finding.rivals:
-            lines.append(f"   weight    {finding.weight:.2f}; this recording can't tell it at 20:1 from")
+            lines.append(
+                f"   weight    {finding.weight:.2f}; this recording can't tell it at 20:1 from"
+            )
             lines += [f"             {words}" for words in doubles(finding)]
             lines.append(f"   separate  {separate_by(finding)}")
         if nearly_as_good(finding):
