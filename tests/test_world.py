@@ -277,6 +277,19 @@ def test_bow_lifts_the_middle_and_not_the_edges():
     assert np.abs(scene.range_change).mean() == pytest.approx(abs(deflection), rel=0.3)
 
 
+def test_another_day_is_the_same_scene_in_another_weather():
+    first, again, later = (
+        simulate_deformation_scene(["focal-drift"], SEED, "small", day=day) for day in (0, 0, 3)
+    )
+    sizes = [made.truth[0].parameters for made in (first, again, later)]
+    assert sizes[0] == sizes[1] == sizes[2]
+    assert first.toml == later.toml
+    assert first.recording_tables["observations"].equals(again.recording_tables["observations"])
+    for name in ("drivers", "observations"):
+        assert not first.recording_tables[name].equals(later.recording_tables[name])
+    assert first.recording_tables["epochs"]["t"].equals(later.recording_tables["epochs"]["t"])
+
+
 def test_one_mark_is_displaced():
     scene = Scene("mark-displaced")
     (name,) = scene.truth[0].place["point"]

@@ -106,10 +106,18 @@ def velocity(plate: Plate, t: Times) -> Float[np.ndarray, "n 6"]:
     return np.column_stack([(ahead.shift - behind.shift) / (2 * h), rate])
 
 
-def build_site(seed: int, size: Size) -> Site:
-    """The site with nothing hidden: every body behaves as the recording will say it does."""
+def of_day(seed: int, stream: int, day: int) -> np.random.Generator:
+    """Draws of a stream of a scene that are others every day."""
+    return np.random.default_rng([seed, stream, day] if day else [seed, stream])
+
+
+def build_site(seed: int, size: Size, day: int = 0) -> Site:
+    """The site with nothing hidden: every body behaves as the recording will say it does.
+
+    On another `day` it has another weather.
+    """
     extent = EXTENTS[size]
-    scene, sky = (np.random.default_rng([seed, stream]) for stream in (1, 2))
+    scene, sky = np.random.default_rng([seed, 1]), of_day(seed, 2, day)
     epoch_t = extent.times(scene)
     weather = make_weather(sky, -BEFORE_S, epoch_t[-1] + 300.0)
     station = Placement(

@@ -13,7 +13,7 @@ from jaxvm.simulate.bodies import Site
 from jaxvm.simulate.effects import HIDEABLE
 from jaxvm.simulate.hidden import Truth
 from jaxvm.simulate.optics import distances, photograph
-from jaxvm.simulate.scene import EXTENTS, Size, build_site
+from jaxvm.simulate.scene import EXTENTS, Size, build_site, of_day
 from jaxvm.simulate.write import Photographs, SimulatedRecording, engineers_model, tables
 
 TOUCHED_PX = 1e-9
@@ -25,6 +25,7 @@ def simulate_deformation_scene(
     seed: int = 0,
     size: Size = "full",
     strength: float = 1.0,
+    day: int = 0,
 ) -> SimulatedRecording:
     """Record the deformation scene with effects hidden in it that recording.toml does not know.
 
@@ -34,6 +35,8 @@ def simulate_deformation_scene(
             stream of its own: the same seed with another `hide` is the same scene and noise.
         size: "full" (97 epochs in 8 h, 6 x 6 marks) or "small" (40 epochs in 6.5 h, 5 x 5).
         strength: factor on the size of every hidden effect.
+        day: of several recordings of one scene: the same bodies and effects in another weather,
+            with other noise.
 
     Raises:
         ValueError: an unknown key, size, or a key given twice.
@@ -48,18 +51,18 @@ def simulate_deformation_scene(
     if size not in EXTENTS:
         raise ValueError(f'no size "{size}"; known: {", ".join(EXTENTS)}')
 
-    plain = build_site(seed, size)
+    plain = build_site(seed, size, day)
     as_modelled = record(plain)
     truth = []
     for key in hide:
-        alone = build_site(seed, size)
+        alone = build_site(seed, size, day)
         told = HIDEABLE[key].into(alone, seed, strength)
         truth.append(_measured(told, as_modelled, record(alone)))
 
-    site = build_site(seed, size)
+    site = build_site(seed, size, day)
     for key in hide:
         HIDEABLE[key].into(site, seed, strength)
-    noise = np.random.default_rng([seed, 3])
+    noise = of_day(seed, 3, day)
     return SimulatedRecording(tables(site, *record(site), noise), engineers_model(plain), truth)
 
 
