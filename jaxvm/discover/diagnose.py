@@ -40,6 +40,9 @@ from jaxvm.solve.adjust import Adjustment, adjust, reference_sigma
 from jaxvm.solve.covariance import effect_deviations
 from jaxvm.solve.snooping import robust_variance
 
+_BEGINNINGS = 3
+"""Times that the search begins, without the gross errors that showed at the end of the last."""
+
 ROOM = (16, 8)
 """Columns and constants kept free for effects to be found."""
 
@@ -76,10 +79,17 @@ def diagnose(
     scene = scene.with_effects(effects, _room(effects))
     progress("fit of the plain model")
     parts, plain, n_rejected = _plain_fit(scene, every)
-    plain, plain_heldout = parts.proven(plain)
-
-    found = Search(parts, plain, plain_heldout, len(effects), alpha, seed)
-    found.run(max_findings, progress)
+    for _ in range(_BEGINNINGS):
+        plain, plain_heldout = parts.proven(plain)
+        found = Search(parts, plain, plain_heldout, len(effects), alpha, seed)
+        found.run(max_findings, progress)
+        # What was found may have concealed gross errors, which stop the search once they show.
+        _, cleaner, n = without_gross_errors(found.current, parts)
+        if not (found.findings and n):
+            break
+        progress(f"{n} gross errors show beside what was found: beginning again without them")
+        parts, n_rejected = cleaner, n
+        plain = parts.fit(scene)
     current, findings = found.current, found.findings
 
     progress("final fit to all epochs")
