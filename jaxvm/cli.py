@@ -21,13 +21,16 @@ def main(arguments: list[str] | None = None) -> int:
     options.interruption = Interruption()
     try:
         with options.interruption:
+            _check_out(options)
             answer, text = options.run(options)
     except KeyboardInterrupt:
         print("interrupted; nothing was left half-written", file=sys.stderr)
         return INTERRUPTED
     except (ValueError, OSError) as problem:
+        from jaxvm.recording.errors import sentence
+
         # Every foreseen complaint is a ValueError or OSError whose message names the mend.
-        print(f"jaxvm {options.command}: {problem}", file=sys.stderr)
+        print(f"jaxvm {options.command}: {sentence(problem)}", file=sys.stderr)
         return BAD_INPUT
     if options.json:
         from jaxvm.recording.files import json_text
@@ -35,6 +38,17 @@ def main(arguments: list[str] | None = None) -> int:
         text = json_text(answer).rstrip()
     print(text)
     return 0
+
+
+def _check_out(options: argparse.Namespace) -> None:
+    """Refuse what can't be written to before anything is computed for it."""
+    if getattr(options, "out", None) is not None:
+        from jaxvm.recording.files import check_place
+
+        try:
+            check_place(options.out, options.writes)
+        except OSError as problem:
+            raise OSError(f"--out {problem}") from None
 
 
 class Interruption:
@@ -91,7 +105,7 @@ def _parser() -> argparse.ArgumentParser:
         help='effects to hide, with commas; "nothing"; drawn by the seed if not given',
     )
     demo.add_argument("--size", choices=("full", "small"), default="full")
-    demo.add_argument("--out", type=Path, default=Path("jaxvm-demo"), metavar="DIR")
+    _out_argument(demo, "folder", "jaxvm-demo", metavar="DIR")
 
     diagnose = command("diagnose", "find the physics that a model left out")
     diagnose.add_argument(
@@ -108,7 +122,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="RECORDING",
         help="a further recording of the same cameras and bodies, diagnosed together with it",
     )
-    diagnose.add_argument("--out", type=Path, default=Path("jaxvm-report"), metavar="DIR")
+    _out_argument(diagnose, "folder", "jaxvm-report", metavar="DIR")
     diagnose.add_argument(
         "--data-only", action="store_true", help="report.json and model.toml, no page, no figures"
     )
@@ -118,7 +132,7 @@ def _parser() -> argparse.ArgumentParser:
 
     adjust = command("adjust", "least-squares adjustment of a recording")
     _recording_argument(adjust)
-    adjust.add_argument("--out", type=Path, default=None, metavar="DIR")
+    _out_argument(adjust, "folder", metavar="DIR")
     adjust.add_argument(
         "--method",
         choices=("levenberg-marquardt", "gauss-newton", "spgd", "lbfgs"),
@@ -140,7 +154,7 @@ def _parser() -> argparse.ArgumentParser:
 
     identify = command("identify", "identify how cameras drift with temperature")
     _recording_argument(identify)
-    identify.add_argument("--out", type=Path, default=Path("drift.toml"), metavar="FILE")
+    _out_argument(identify, "file", "drift.toml", metavar="FILE")
     identify.add_argument(
         "--two-steps", action="store_true", help="do not refine through the residual of the network"
     )
@@ -150,7 +164,7 @@ def _parser() -> argparse.ArgumentParser:
     compensate.add_argument(
         "--model", type=Path, required=True, metavar="FILE", help="what jaxvm identify wrote"
     )
-    compensate.add_argument("--out", type=Path, required=True, metavar="RECORDING")
+    _out_argument(compensate, "new", required=True, metavar="RECORDING")
 
     simulate = command("simulate", "write a simulated recording")
     simulate.add_argument(
@@ -159,7 +173,7 @@ def _parser() -> argparse.ArgumentParser:
         "examples by its name (ship, tunnel, bridge, wind-tunnel, chain, double-chain, ring, "
         "station, random), or a TOML that describes one",
     )
-    simulate.add_argument("--out", type=Path, required=True, metavar="RECORDING")
+    _out_argument(simulate, "new", required=True, metavar="RECORDING")
     simulate.add_argument("--seed", type=_natural, default=0, help="of the noise")
     simulate.add_argument(
         "--truth",
@@ -197,10 +211,9 @@ def _parser() -> argparse.ArgumentParser:
         choices=("gauss-newton", "levenberg-marquardt", "spgd"),
         default="gauss-newton",
     )
-    montecarlo.add_argument(
-        "--out",
-        type=Path,
-        default=None,
+    _out_argument(
+        montecarlo,
+        "folder",
         metavar="DIR",
         help="where trials and tables are written; what was stopped there goes on",
     )
@@ -212,8 +225,8 @@ def _parser() -> argparse.ArgumentParser:
         "calibration (.yml, .xml), a pose graph (.g2o, .g2o.gz), a problem of bundle adjustment "
         "(.txt, .txt.gz, libmv's .bin), the folder of a recording, or the name of a public one",
     )
-    convert.add_argument(
-        "--out", type=Path, required=True, metavar="RECORDING", help="a folder, or a .g2o file"
+    _out_argument(
+        convert, "new", required=True, metavar="RECORDING", help="a folder, or a .g2o file"
     )
     convert.add_argument(
         "--mend", action="store_true", help="g2o: mend information that is not positive definite"
@@ -242,6 +255,14 @@ def _model_argument(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--model", type=Path, default=None, metavar="FILE", help="in place of its recording.toml"
     )
+
+
+def _out_argument(
+    parser: argparse.ArgumentParser, writes: str, default: str | None = None, **words: Any
+) -> None:
+    """`writes`: a kind of `jaxvm.recording.files.Place`."""
+    parser.add_argument("--out", type=Path, default=default and Path(default), **words)
+    parser.set_defaults(writes=writes)
 
 
 def _natural(text: str) -> int:

@@ -56,6 +56,8 @@ def run_demo(options):
 
 
 def run_diagnose(options):
+    from jaxvm.recording.errors import sentence
+    from jaxvm.recording.files import check_place
 
     if not 0.0 < options.alpha < 1.0:
         raise ValueError(f"--alpha is {options.alpha:g}; it is a probability between 0 and 1")
@@ -67,12 +69,14 @@ def run_diagnose(options):
     twice = {folder for folder in folders if folders.count(folder) > 1}
     if twice:
         raise ValueError(f"two recordings are called {min(twice)}; their reports would collide")
+    for folder in folders:
+        check_place(options.out / folder, "folder")
     answers, failed = {}, []
     for name, folder in zip(options.recording, folders, strict=True):
         try:
             answers[folder], _ = _diagnose_one(options, name, options.out / folder)
         except (ValueError, OSError) as problem:
-            print(f"jaxvm diagnose {name}: {problem}", file=sys.stderr, flush=True)
+            print(f"jaxvm diagnose {name}: {sentence(problem)}", file=sys.stderr, flush=True)
             failed.append(folder)
     lines = [f"{folder}: {answer['verdict']}" for folder, answer in answers.items()]
     if failed:
@@ -217,7 +221,7 @@ def run_simulate(options):
 
 def _simulate_network(options):
     from jaxvm.recording import describe
-    from jaxvm.scenes import read_description, simulate_network
+    from jaxvm.scenes import read_description, simulate_network, truth_folder
 
     for name in ("hide", "size", "strength"):
         if getattr(options, name) is not None:
@@ -225,8 +229,9 @@ def _simulate_network(options):
                 f"--{name} is for deformation; what a network hides stands in its TOML, as "
                 '[[effects]] with model = "hidden"'
             )
+    truth = truth_folder(options.out, options.truth)
     made = simulate_network(read_description(options.scene), options.seed)
-    truth = made.write(options.out, options.truth)
+    made.write(options.out, truth)
     told, hidden = describe(made.recording), list(made.truth.hidden)
     answer = {
         "recording": str(options.out),

@@ -74,6 +74,14 @@ def test_bad_arguments(arguments, words, tmp_path, capsys, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_what_the_system_refuses_is_told_without_its_number(board, capsys):
+    (board / "drivers.csv").mkdir()
+    assert main(["validate", str(board)]) == 2
+    said = capsys.readouterr().err
+    assert "drivers.csv: it can't be read or written (is a directory); mend" in said
+    assert "Errno" not in said
+
+
 def test_unknown_option_is_status_2(capsys):
     with pytest.raises(SystemExit) as stopped:
         main(["diagnose", "--colour"])
@@ -189,3 +197,45 @@ def test_monte_carlo_of_a_described_network(tmp_path, capsys):
     assert 'no noise "pink"' in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main(["montecarlo", str(scene), "--trials", "0"])
+
+
+NEW = "simulate chain", "convert board", "compensate board --model drift.toml"
+FOLDERS = "diagnose board", "adjust board", "montecarlo chain", "demo"
+
+
+@pytest.mark.parametrize(
+    ("place", "words"),
+    [
+        ("afile", "afile is "),
+        ("afile/x", "afile is a file, not a folder; choose another place"),
+        ("/proc/x", "the folder /proc takes no files; choose another place"),
+    ],
+)
+@pytest.mark.parametrize("command", [*NEW, *FOLDERS, "identify board"])
+def test_a_place_that_cannot_be_written_is_refused_before_any_work(
+    command, place, words, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "afile").touch()
+    if place.startswith("/proc") and not os.path.isdir("/proc"):
+        pytest.skip("there is no /proc here")
+    if command.startswith("identify") and place == "afile":
+        place, words = ".", "is a folder, not a file; choose another name"
+    # There is no recording either: whoever looks for it first has begun to work.
+    assert main([*command.split(), "--out", place]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"jaxvm {command.split()[0]}: --out {place} ") and words in said
+    assert said.count("\n") == 1 and "Errno" not in said
+    assert [file.name for file in tmp_path.iterdir()] == ["afile"]
+
+
+def test_the_place_of_the_truth_is_refused_before_any_work(tmp_path, capsys):
+    (tmp_path / "ship-truth").touch()
+    assert main(["simulate", "nothing", "--out", str(tmp_path / "ship")]) == 2
+    assert "ship-truth is already there" in capsys.readouterr().err
+
+
+def test_the_folders_of_several_reports_are_refused_before_any_work(tmp_path, capsys):
+    (tmp_path / "b").touch()
+    assert main(["diagnose", "a", "b", "--out", str(tmp_path)]) == 2
+    assert "b is a file, not a folder" in capsys.readouterr().err

@@ -264,6 +264,30 @@ def test_failed_files_leave_the_old_ones(tmp_path):
     assert {f.name: f.read_text() for f in tmp_path.iterdir()} == {"a": "old", "b": "old"}
 
 
+def test_files_take_their_places_together_or_not_at_all(tmp_path, monkeypatch):
+    """One of them can't be written: none is, and the complaint is of their place alone."""
+    out = tmp_path / "out"
+    (out / "b").mkdir(parents=True)
+    with pytest.raises(OSError, match=r"out/b is a folder, not a file; remove it"):
+        write_files(out, {"a": "new", "b": "new"})
+    assert [file.name for file in out.iterdir()] == ["b"]
+
+    def full(*_):
+        raise OSError(28, "No space left on device", ".writing-123/a")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(OSError, match=r"new can't be written \(no space left on device\); mend"):
+        write_files(tmp_path / "new", {"a": "new"})
+    assert [file.name for file in tmp_path.iterdir()] == ["out"]
+
+
+def test_an_empty_folder_takes_a_recording(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_recording(board_recording().recording, ".")
+    assert read_recording(tmp_path).timed
+    assert not [file for file in tmp_path.iterdir() if file.name.startswith(".")]
+
+
 def test_a_folder_is_not_overwritten(folder):
     recording = read_recording(folder)
     with pytest.raises(FileExistsError, match="already there; choose another name"):

@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 from jaxtyping import Int
 
 from jaxvm.montecarlo.trials import Trial
-from jaxvm.recording.files import json_text, write_files
+from jaxvm.recording.files import json_text, one_sentence, write_files
 
 _MANIFEST = "study.json"
 
@@ -78,7 +78,7 @@ class Store:
                     f"{place}: the trials here are of another study ({', '.join(other)} differ); "
                     "choose another folder, or remove this one"
                 )
-        elif self.folder.exists() and any(self.folder.iterdir()):
+        elif self.folder.is_dir() and any(self.folder.iterdir()):
             raise FileExistsError(
                 f"{self.folder} holds other files and no {_MANIFEST}; choose another folder"
             )
@@ -93,18 +93,19 @@ class Store:
         """Add a part; it is on the disk when this returns."""
         columns = columns_of(numbers, found)
         table = pa.table(columns).replace_schema_metadata({"study": json.dumps(self.manifest)})
-        handle, staging = tempfile.mkstemp(prefix=".writing-", dir=self.folder)
-        try:
-            with os.fdopen(handle, "wb") as file:
-                pq.write_table(table, file, compression="zstd")
-                file.flush()
-                os.fsync(file.fileno())
-            last = self.parts()[-1:]
-            number = int(last[0].stem.rpartition("-")[2]) + 1 if last else 0
-            os.replace(staging, self.folder / f"trials-{number:04d}.parquet")
-        except BaseException:
-            Path(staging).unlink(missing_ok=True)
-            raise
+        with one_sentence(self.folder):
+            handle, staging = tempfile.mkstemp(prefix=".writing-", dir=self.folder)
+            try:
+                with os.fdopen(handle, "wb") as file:
+                    pq.write_table(table, file, compression="zstd")
+                    file.flush()
+                    os.fsync(file.fileno())
+                last = self.parts()[-1:]
+                number = int(last[0].stem.rpartition("-")[2]) + 1 if last else 0
+                os.replace(staging, self.folder / f"trials-{number:04d}.parquet")
+            except BaseException:
+                Path(staging).unlink(missing_ok=True)
+                raise
 
     def read(self) -> Iterator[tuple[Int[np.ndarray, " t"], Trial]]:
         """Trials part by part.

@@ -16,6 +16,16 @@ class RecordingError(ValueError):
     """Something in a recording is wrong; the message names the file, the line and the mend."""
 
 
+def sentence(problem: Exception) -> str:
+    """A complaint as it is told: the system's own ones without their numbers, and with a mend."""
+    if isinstance(problem, OSError) and problem.strerror is not None:
+        return (
+            f"{problem.filename}: it can't be read or written ({problem.strerror.lower()}); mend "
+            "that or give another"
+        )
+    return str(problem)
+
+
 def toml_error(text: str, path: TomlPath, problem: str) -> RecordingError:
     """Error at a table or key of recording.toml, whose line is looked up in its text."""
     line = line_of(text, path)

@@ -9,7 +9,7 @@ from jaxvm.scenes.layouts import LAYOUTS, Layout, Plan, Structure
 from jaxvm.scenes.make import simulate_network
 from jaxvm.scenes.parse import parse_description
 from jaxvm.scenes.read import description_text, example_names, read_description
-from jaxvm.scenes.truth import Simulated, Truth
+from jaxvm.scenes.truth import Simulated, Truth, truth_folder
 
 __all__ = [
     "Description",
@@ -24,4 +24,5 @@ __all__ = [
     "parse_description",
     "read_description",
     "simulate_network",
+    "truth_folder",
 ]

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from jaxvm.network.scene import Scene
 from jaxvm.network.state import State
 from jaxvm.physics.effects import Effect
-from jaxvm.recording.files import new_folder
+from jaxvm.recording.files import check_place, new_folder
 from jaxvm.recording.recording import Recording
 from jaxvm.recording.write import write_recording
 
@@ -86,22 +86,32 @@ class Simulated:
     def write(self, folder: str | Path, truth: str | Path | None = None) -> Path:
         """Write the recording into a new folder and the truth into another; returns the latter.
 
-        By default the truth is beside the recording, in a folder of its name with "-truth".
-
         Raises:
-            FileExistsError: one of the folders is already there and not empty.
+            OSError: one of the folders is already there and not empty, or can't be written.
             ValueError: one folder would be inside the other.
         """
-        folder = Path(folder)
-        beside = folder.with_name(f"{folder.name}-truth") if truth is None else Path(truth)
-        ours, theirs = folder.resolve(), beside.resolve()
-        if ours == theirs or ours in theirs.parents or theirs in ours.parents:
-            raise ValueError(
-                f"of the truth in {beside} and the recording in {folder} one would be in the "
-                "other; give the truth a folder of its own"
-            )
+        beside = truth_folder(folder, truth)
         with new_folder(beside) as staging:
             for name, text in self.truth.files().items():
                 (staging / name).write_text(text, encoding="utf-8")
             write_recording(self.recording, folder)
         return beside
+
+
+def truth_folder(folder: str | Path, truth: str | Path | None = None) -> Path:
+    """Where the truth of a recording is written: by default beside it, with "-truth" in its name.
+
+    Raises:
+        OSError: it is already there and not empty, or can't be written.
+        ValueError: one folder would be inside the other.
+    """
+    folder = Path(folder)
+    beside = folder.with_name(f"{folder.name}-truth") if truth is None else Path(truth)
+    ours, theirs = folder.resolve(), beside.resolve()
+    if ours == theirs or ours in theirs.parents or theirs in ours.parents:
+        raise ValueError(
+            f"of the truth in {beside} and the recording in {folder} one would be in the "
+            "other; give the truth a folder of its own"
+        )
+    check_place(beside, "new")
+    return beside
