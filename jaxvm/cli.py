@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from jaxvm import __version__, commands
+from jaxvm_command import INTERRUPTED, LAST_WORDS
 
 BAD_INPUT = 2
-INTERRUPTED = 130
 
 _RECORDING = "folder of a recording, a pose graph (.g2o), or the name of a public recording"
 
@@ -24,7 +24,7 @@ def main(arguments: list[str] | None = None) -> int:
             _check_out(options)
             answer, text = options.run(options)
     except KeyboardInterrupt:
-        print("interrupted; nothing was left half-written", file=sys.stderr)
+        print(LAST_WORDS, file=sys.stderr)
         return INTERRUPTED
     except (ValueError, OSError) as problem:
         from jaxvm.recording.errors import sentence

@@ -128,6 +128,21 @@ def test_an_interrupt_that_a_callback_swallowed_is_not_lost():
     assert signal.getsignal(signal.SIGINT) is before
 
 
+def test_an_interrupt_while_packages_are_imported():
+    run = subprocess.Popen(
+        [sys.executable, "-X", "importtime", "-m", "jaxvm_command", "validate", "nothing"],
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert run.stderr is not None
+    while "numpy" not in run.stderr.readline():
+        assert run.poll() is None
+    run.send_signal(signal.SIGINT)
+    _, said = run.communicate(timeout=60)
+    told = [line for line in said.splitlines() if not line.startswith("import time:")]
+    assert run.returncode == 130 and told == ["interrupted; nothing was left half-written"]
+
+
 def test_interrupted_run_leaves_nothing(board, tmp_path):
     out = tmp_path / "report"
     run = subprocess.Popen(
