@@ -1,5 +1,6 @@
 """The command line: arguments, exit status, interruption. `jaxvm.commands` does the work."""
 
+import _thread
 import argparse
 import signal
 import sys
@@ -23,10 +24,13 @@ def main(arguments: list[str] | None = None) -> int:
         with options.interruption:
             _check_out(options)
             answer, text = options.run(options)
-    except KeyboardInterrupt:
-        print(LAST_WORDS, file=sys.stderr)
-        return INTERRUPTED
-    except (ValueError, OSError) as problem:
+    except (KeyboardInterrupt, Exception) as problem:
+        # A library may have made another error of an interruption.
+        if options.interruption.asked or isinstance(problem, KeyboardInterrupt):
+            print(LAST_WORDS, file=sys.stderr)
+            return INTERRUPTED
+        if not isinstance(problem, ValueError | OSError):
+            raise
         from jaxvm.recording.errors import sentence
 
         # Every foreseen complaint is a ValueError or OSError whose message names the mend.
@@ -52,24 +56,38 @@ def _check_out(options: argparse.Namespace) -> None:
 
 
 class Interruption:
-    """Ctrl-C, remembered: what arrives in a library's callback is lost there, but not here."""
+    """Ctrl-C, remembered and repeated: what arrives in a callback of a library is lost there."""
 
     def __init__(self) -> None:
         self.asked = False
         self._former: Any = None
+        self._told = sys.unraisablehook
+        self._again: threading.Timer | None = None
 
     def __enter__(self) -> "Interruption":
         if threading.current_thread() is threading.main_thread():
             self._former = signal.signal(signal.SIGINT, self._stop)
+            self._told, sys.unraisablehook = sys.unraisablehook, self._swallowed
         return self
 
     def __exit__(self, *_: object) -> None:
         if self._former is not None:
+            if self._again is not None:
+                self._again.cancel()
+            sys.unraisablehook = self._told
             signal.signal(signal.SIGINT, self._former)
 
     def _stop(self, *_: object) -> None:
         self.asked = True
         raise KeyboardInterrupt
+
+    def _swallowed(self, unraisable: "sys.UnraisableHookArgs") -> None:
+        """Interrupt again, soon, what could not be interrupted, such as a garbage collection."""
+        if unraisable.exc_type is not KeyboardInterrupt:
+            return self._told(unraisable)
+        self._again = threading.Timer(0.05, _thread.interrupt_main)
+        self._again.daemon = True
+        self._again.start()
 
     def check(self) -> None:
         """Stop now if somebody asked for it before.

@@ -1,5 +1,6 @@
 """Commands: answers, JSON, bad input with status 2 and nothing half-done, interruption."""
 
+import gc
 import json
 import os
 import signal
@@ -12,6 +13,7 @@ import pytest
 from networks import board_recording
 from pose_networks import network
 
+from jaxvm import commands
 from jaxvm.cli import Interruption, main
 from jaxvm.recording import read_recording, write_recording
 from jaxvm.recording.g2o import import_g2o, write_g2o
@@ -126,6 +128,35 @@ def test_an_interrupt_that_a_callback_swallowed_is_not_lost():
         with pytest.raises(KeyboardInterrupt):
             interruption.check()
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_an_interrupt_in_a_garbage_collection_comes_again(capsys):
+    """Python prints an exception of such a callback, and goes on as if nothing had been."""
+    hook, arrived = sys.unraisablehook, []
+
+    def interrupted(phase: str, _: dict) -> None:
+        gc.callbacks.remove(interrupted)
+        signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt), Interruption():
+        gc.callbacks.append(interrupted)
+        gc.collect()
+        arrived.append("here")
+        time.sleep(60)
+    assert arrived == ["here"] and capsys.readouterr().err == ""
+    assert sys.unraisablehook is hook
+
+
+def test_what_a_library_makes_of_an_interrupt_is_one(board, capsys, monkeypatch):
+    def run(_):
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt as problem:
+            raise RuntimeError("a callback failed") from problem
+
+    monkeypatch.setattr(commands, "run_validate", run)
+    assert main(["validate", str(board)]) == 130
+    assert capsys.readouterr().err == "interrupted; nothing was left half-written\n"
 
 
 def test_an_interrupt_while_packages_are_imported():
