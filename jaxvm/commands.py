@@ -105,7 +105,7 @@ def run_adjust(options):
     from jaxvm.network.start import is_network, start
     from jaxvm.recording import model_text
     from jaxvm.recording.files import json_text, write_files
-    from jaxvm.report.network import write_network_page
+    from jaxvm.report.network import network_files
     from jaxvm.solve.adjust import adjust, pixel_rms
     from jaxvm.solve.covariance import standard_deviations
     from jaxvm.solve.optimise import METHODS
@@ -153,18 +153,11 @@ def run_adjust(options):
             "model.toml": model_text(estimated_model(result.scene)),
             "poses.csv": pose_table(result.scene, deviations).to_csv(index=False),
         }
-        write_files(options.out, files)
-        names = list(files)
         if is_network(result.scene):
             progress("the picture of the network")
-            page = write_network_page(
-                result,
-                options.out,
-                method=options.method,
-                scale=result.unit_variance,
-            )
-            names.append(page.name)
-        text += f"\nwritten            {options.out}: {', '.join(names)}"
+            files |= network_files(result, method=options.method, scale=result.unit_variance)
+        write_files(options.out, files)
+        text += f"\nwritten            {options.out}: {', '.join(files)}"
     return answer, text
 
 

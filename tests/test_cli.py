@@ -192,6 +192,19 @@ def test_interrupted_run_leaves_nothing(board, tmp_path):
     assert not [f for f in tmp_path.iterdir() if f.name.startswith(".")]
 
 
+def test_an_adjustment_interrupted_at_its_picture_leaves_nothing(tmp_path, capsys, monkeypatch):
+    graph = tmp_path / "graph.g2o"
+    write_g2o(network(seed=2).recording, graph)
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("jaxvm.report.network._html", interrupted)
+    assert main(["adjust", str(graph), "--out", str(tmp_path / "out"), "--quiet"]) == 130
+    assert capsys.readouterr().err == "interrupted; nothing was left half-written\n"
+    assert [file.name for file in tmp_path.iterdir()] == ["graph.g2o"]
+
+
 def test_a_pose_graph_goes_in_and_out(tmp_path, capsys):
     """A gross error among its links is named; the pictures are written; g2o comes out again."""
     recording = network(seed=2).recording

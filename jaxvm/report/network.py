@@ -59,14 +59,31 @@ def write_network_page(
     method: str = "",
     scale: float = 1.0,
 ) -> Path:
-    """Write network.html and network.json into a folder; returns the path of the page.
+    """Write `network_files` into a folder; returns the path of network.html.
 
-    The page holds all that it needs: nothing is fetched. Files of an earlier page are replaced.
+    The folder is made if it is not there. Files of an earlier page are replaced.
+
+    Raises:
+        ValueError: a history has not one cost for each evaluation.
+        OSError: the folder can't be written.
+    """
+    write_files(folder, network_files(adjustment, histories, method, scale))
+    return Path(folder) / "network.html"
+
+
+def network_files(
+    adjustment: Adjustment,
+    histories: Mapping[str, History] | None = None,
+    method: str = "",
+    scale: float = 1.0,
+) -> dict[str, str]:
+    """The texts of network.html and network.json, by their names.
+
+    The page holds all that it needs: nothing is fetched.
 
     Args:
         adjustment: of a scene with links, sight lines, or both. Links of weight zero are shown as
             rejected.
-        folder: made if it is not there.
         histories: of further methods: evaluations, and the cost after each.
         method: that the adjustment itself used, in words.
         scale: factor on covariances: 1 trusts the stated sigmas, the variance factor the residuals.
@@ -75,10 +92,8 @@ def write_network_page(
         ValueError: a history has not one cost for each evaluation.
     """
     numbers = _numbers(adjustment, histories, method, scale)
-    page = _html(numbers)
     text = json.dumps(numbers.document, allow_nan=False) + "\n"
-    write_files(folder, {"network.json": text, "network.html": page})
-    return Path(folder) / "network.html"
+    return {"network.html": _html(numbers), "network.json": text}
 
 
 def network_document(
