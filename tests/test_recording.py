@@ -133,6 +133,10 @@ def text_of(name: str, text: str):
     return lambda folder: (folder / name).write_text(text)
 
 
+def bytes_of(name: str, data: bytes):
+    return lambda folder: (folder / name).write_bytes(data)
+
+
 def drop_rows(name: str, column: str, value: str, keep: int):
     def change(frame):
         own = np.flatnonzero(frame[column] == value)
@@ -145,7 +149,16 @@ WRONG = {
     "no model": (remove("recording.toml"), r"recording\.toml: there is no such file"),
     "no observations": (remove("observations.csv"), r"observations\.csv: there is no such file"),
     "no epochs": (remove("epochs.csv"), r"epochs\.csv: there is no such file"),
-    "not toml": (text_of("recording.toml", "format = 1\nname = \n"), r"recording\.toml: .*line 2"),
+    "not toml": (text_of("recording.toml", "format = 1\nname = \n"),
+                 r"recording\.toml line 2: this is not valid TOML \(invalid value in column 8\)"),
+    "half a toml": (text_of("recording.toml", "format = 1\nname = [1,\n"),
+                    r"recording\.toml line 2: this is not valid TOML \(.*\); mend it"),
+    "toml in Latin-1": (bytes_of("recording.toml", b'format = 1\nname = "Br\xfccke"\n'),
+                        r"recording\.toml line 2: the byte 0xfc .*; save the file as UTF-8"),
+    "no format": (toml(r"format = 1\n", ""),
+                  r"^recording\.toml: it has no format; add format = 1$"),
+    "unknown table": (toml(r"\[noise\]", "[nois]"),
+                      r'^recording\.toml line \d+: unknown key "nois"; did you mean "noise"\?$'),
     "other format": (toml(r"format = 1", "format = 9"), r"recording\.toml line 1: format is 9"),
     "unknown key": (toml(r"image_size", "imagesize"), r"line \d+: unknown key .*did you mean"),
     "unknown lens": (toml(r"opencv5", "opencv6"), r"line \d+: .*lens is 'opencv6'; it must be one"),
@@ -159,7 +172,8 @@ WRONG = {
     "unknown camera": (put("observations", 810, "camera", "lft"),
                        r'observations\.csv line 812: camera "lft" .*left, right.*"left"'),
     "unknown target": (put("observations", 3, "target", "dek"), r'line 5: target "dek".*"deck"'),
-    "unknown point": (put("observations", 3, "point", "9/9"), r'line 5: point "9/9"'),
+    "unknown point": (put("observations", 3, "point", "9/9"),
+                      r'line 5: point "9/9" .* \(it has: 0/0, .*, and \d+ more\); mend the name$'),
     "unknown epoch": (put("observations", 7, "epoch", "4711"), r"line 9: epoch 4711"),
     "no number": (put("observations", 5, "u", "abc"), r"line 7: u is abc"),
     "nan": (put("observations", 5, "v", "nan"), r"line 7: v is NaN"),
@@ -186,8 +200,15 @@ WRONG = {
     "range in mm": (put("ranges", 2, "range_m", "8123.4"), r"ranges\.csv line 4: .*looks like mm"),
     "negative range": (put("ranges", 2, "range_m", "-1"), r"line 4: range_m is -1"),
     "unknown finder": (put("ranges", 2, "rangefinder", "dist"), r'"dist".*"disto"'),
-    "ragged": (lambda folder: (folder / "epochs.csv").write_text("epoch,t\n0,0\n1,1,1\n"),
-               r"epochs\.csv"),
+    "ragged": (text_of("epochs.csv", "epoch,t\n0,0\n1,1,1\n"),
+               r"epochs\.csv line 3: 3 fields, the header 2; every line"),
+    "semicolons": (text_of("epochs.csv", "epoch;t\n0;0,5\n"),
+                   r'epochs\.csv line 1: its fields are separated by ";"; save .* decimal points'),
+    "tabs": (text_of("epochs.csv", "epoch\tt\n0\t0.5\n"), r"epochs\.csv line 1: .* by tabs; save"),
+    "decimal commas": (text_of("epochs.csv", "epoch,t\n0,0,5\n1,1,5\n"),
+                       r"epochs\.csv line 2: .* decimal point"),
+    "csv in Latin-1": (bytes_of("epochs.csv", b"epoch,t\n0,0\n1,\xb11\n"),
+                       r"epochs\.csv line 3: the byte 0xb1 .*; save the file as UTF-8"),
     "empty file": (text_of("epochs.csv", ""), r"epochs\.csv line 1: the file is empty"),
     "no rows": (text_of("epochs.csv", "epoch,t\n"), r"no row below the header"),
     "both tables": (lambda folder: pd.read_csv(folder / "epochs.csv").to_parquet(

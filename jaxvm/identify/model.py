@@ -1,6 +1,5 @@
 """Drift models of cameras as files: what was identified, on what, and how far it may be trusted."""
 
-import tomllib
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from jaxvm.identify.inputs import Inputs
 from jaxvm.identify.lags import Lags, Structure
 from jaxvm.physics.drivers import POWER_ON
 from jaxvm.physics.ports import PORT_INDEX
+from jaxvm.recording.texts import parse_toml, read_text
 
 FORMAT = 1
 
@@ -149,10 +149,7 @@ def read_drift_model(file: str | Path) -> DriftModel:
     file = Path(file)
     if not file.is_file():
         raise ValueError(f"{file}: there is no such file; give the one that jaxvm identify wrote")
-    try:
-        table = tomllib.loads(file.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as problem:
-        raise ValueError(f"{file.name}: this is not valid TOML: {problem}; mend it") from None
+    table = parse_toml(read_text(file, file.name), file.name)
     if table.get("format") != FORMAT or not isinstance(table.get("cameras"), dict):
         raise ValueError(
             f"{file.name}: this is no drift model of format {FORMAT}; give the file that jaxvm "

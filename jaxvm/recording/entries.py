@@ -39,12 +39,14 @@ class Entry:
         """The same entry, after a check that it has no other keys."""
         for key in self.table:
             if key not in known:
-                self.fail(key, f'unknown key "{key}" in {self.title()}; {did_you_mean(key, known)}')
+                where = f" in {self.title()}" if self.path else ""
+                self.fail(key, f'unknown key "{key}"{where}; {did_you_mean(key, known)}')
         return self
 
     def needs(self, key: str, example: str) -> Any:
         if key not in self.table:
-            self.fail(None, f"{self.title()} has no {key}; add {key} = {example}")
+            name = self.title() if self.path else "it"
+            self.fail(None, f"{name} has no {key}; add {key} = {example}")
         return self.table[key]
 
     def entry(self, key: str) -> "Entry":

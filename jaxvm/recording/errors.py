@@ -1,7 +1,7 @@
 """Errors in recordings: one sentence that names the file, the line and the mend."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 
 _HEADER = re.compile(r"^\s*(\[\[?)\s*(.+?)\s*\]\]?\s*(#.*)?$")
@@ -31,6 +31,11 @@ def toml_error(text: str, path: TomlPath, problem: str) -> RecordingError:
     line = line_of(text, path)
     place = "recording.toml" if line is None else f"recording.toml line {line}"
     return RecordingError(f"{place}: {problem}")
+
+
+def in_file(problem: RecordingError, file: str) -> RecordingError:
+    """An error about recording.toml, told of the file that stands in its place."""
+    return RecordingError(str(problem).replace("recording.toml", file))
 
 
 def line_of(text: str, path: TomlPath) -> int | None:
@@ -71,17 +76,31 @@ def _shared(here: TomlPath, path: TomlPath) -> int:
     return shared
 
 
-def has(names: Iterable[str], most: int = 12) -> str:
+def has(names: Iterable[str]) -> str:
     """The names that would have been right, in brackets, for an error about one that is wrong."""
     known = list(names)
-    if not known:
-        return "(it has none)"
-    more = f", and {len(known) - most} more" if len(known) > most else ""
-    return f"(it has: {', '.join(known[:most])}{more})"
+    return f"(it has: {listed(known)})" if known else "(it has none)"
+
+
+def has_not(name: str, names: Iterable[str]) -> str:
+    """The names that would have been right, and the mend: the nearest of them, if one is near."""
+    known = list(names)
+    near = _nearest(name, known)
+    return f"{has(known)}; " + (f'did you mean "{near}"?' if near else "mend the name")
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """The mend for a wrong name: the nearest right one, or all of them."""
     known = list(known)
-    near = get_close_matches(name, known, n=1, cutoff=0.6)
-    return f'did you mean "{near[0]}"?' if near else f"known here: {', '.join(known)}"
+    near = _nearest(name, known)
+    return f'did you mean "{near}"?' if near else f"known here: {listed(known, 30)}"
+
+
+def listed(names: Sequence[str], most: int = 12) -> str:
+    """Names with commas; of very many the first."""
+    more = f", and {len(names) - most} more" if len(names) > most else ""
+    return f"{', '.join(names[:most])}{more}"
+
+
+def _nearest(name: str, known: list[str]) -> str | None:
+    return next(iter(get_close_matches(name, known, n=1, cutoff=0.6)), None)

@@ -18,7 +18,8 @@ from jaxvm.geometry.targets import grid_points
 from jaxvm.recording.errors import RecordingError, has
 from jaxvm.recording.model import LENSES, Camera, Model, Station, Target, grid_names
 from jaxvm.recording.recording import Observations, Recording
-from jaxvm.recording.tables import Table
+from jaxvm.recording.tables import read_csv
+from jaxvm.recording.texts import read_text
 
 _CORNERS = ("frame", "row", "col", "u", "v", "weight")
 
@@ -108,8 +109,7 @@ def import_corner_table(
     file = Path(file)
     if not file.is_file():
         raise RecordingError(f"{file}: there is no such file; give the table of corners")
-    frame = pd.read_csv(file, dtype=str, keep_default_na=False)
-    table = Table(file.name, frame, np.arange(len(frame)) + 2)
+    table = read_csv(file)
     table.needs(_CORNERS)
     columns = {name: table.whole(name, "a whole number from 0") for name in _CORNERS[:3]}
     columns |= {name: table.numbers(name, "a number") for name in _CORNERS[3:]}
@@ -157,7 +157,7 @@ def import_corners_vnl(
         raise RecordingError(f"{file}: there is no such file; give mrcal's corners.vnl")
     images: dict[str, list[tuple[int, list[str]]]] = {}
     legend = ["filename", "x", "y", "level"]
-    for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), start=1):
+    for number, line in enumerate(read_text(file, file.name).splitlines(), start=1):
         if line.startswith("##") or line.startswith("#!") or not line.strip():
             continue
         fields = line.split()
@@ -232,7 +232,7 @@ def import_cameramodel(file: str | Path) -> Recording:
     file = Path(file)
     if not file.is_file():
         raise RecordingError(f"{file}: there is no such file; give a .cameramodel of mrcal")
-    text = file.read_text(encoding="utf-8")
+    text = read_text(file, file.name)
     try:
         table = ast.literal_eval("\n".join(x for x in text.splitlines() if x.lstrip()[:1] != "#"))
         packed = table["optimization_inputs"]
@@ -288,7 +288,7 @@ def import_opencv_calibration(
     if image_size is None:
         if "image_width" not in nodes or "image_height" not in nodes:
             raise RecordingError(
-                f"{file.name}: it has no image_width and image_height; give image_size"
+                f"{file.name}: it has no image_width and image_height; give them with --image-size"
             )
         image_size = int(nodes["image_width"]), int(nodes["image_height"])
     if "camera_matrix" in nodes:

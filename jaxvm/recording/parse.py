@@ -12,7 +12,7 @@ from jaxvm.physics.effects import Effect, Scope, Term
 from jaxvm.physics.forms import BASES, FORMS
 from jaxvm.physics.ports import PORT_INDEX
 from jaxvm.recording.entries import Entry
-from jaxvm.recording.errors import did_you_mean, has
+from jaxvm.recording.errors import has_not
 from jaxvm.recording.model import (
     FORMAT,
     LENSES,
@@ -308,7 +308,7 @@ def _prior(entry: Entry, model: Model) -> Prior:
     kind, name, quantity = parts
     named = {body.name: body for body in bodies[kind][0]}
     if name not in named:
-        entry.fail("parameter", f'there is no "{name}" in [{kind}] {has(named)}; mend the name')
+        entry.fail("parameter", f'there is no "{name}" in [{kind}] {has_not(name, named)}')
     width = {"focal": 2, "centre": 2, "pose": 6}.get(quantity, 0)
     body = named[name]
     if isinstance(body, Camera) and quantity == "distortion":
@@ -407,7 +407,9 @@ def _scope(entry: Entry, model: Model) -> Scope:
         chosen[kind] = tuple(entry.names(kind) or ())
         for name in chosen[kind]:
             if name not in names:
-                entry.fail(kind, f'{entry.title(kind)}: there is no {kind} "{name}" {has(names)}')
+                entry.fail(
+                    kind, f'{entry.title(kind)}: there is no {kind} "{name}" {has_not(name, names)}'
+                )
     return Scope(**chosen)
 
 
@@ -424,8 +426,7 @@ def known_link(entry_text: str, model: Model, names: list[str]) -> None:
             if times[name] == 0:
                 entry.fail(
                     "links",
-                    f'link "{name}" of a closure is not in the links {has(times)}; '
-                    + did_you_mean(name, times),
+                    f'link "{name}" of a closure is not in the links {has_not(name, times)}',
                 )
             if times[name] > 1:
                 entry.fail(

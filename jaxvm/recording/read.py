@@ -1,12 +1,11 @@
 """Read and check a recording: whatever is wrong is said with file, line and mend."""
 
-import tomllib
 from pathlib import Path
 
 import numpy as np
 
 from jaxvm.recording.check import check_recording
-from jaxvm.recording.errors import RecordingError, did_you_mean, has
+from jaxvm.recording.errors import RecordingError, has_not, in_file
 from jaxvm.recording.model import Model
 from jaxvm.recording.parse import known_link, parse_model
 from jaxvm.recording.recording import (
@@ -19,6 +18,7 @@ from jaxvm.recording.recording import (
     uncorrelated,
 )
 from jaxvm.recording.tables import Table, read_table
+from jaxvm.recording.texts import parse_toml, read_text
 from jaxvm.recording.write import COVARIANCES, RATES
 
 _POSE = ("turn_x", "turn_y", "turn_z", "shift_x", "shift_y", "shift_z")
@@ -83,17 +83,12 @@ def read_model(file: str | Path) -> tuple[Model, str]:
             f"{file.name}: there is no such file in {file.parent}; write one with the cameras and "
             "targets (the README shows an example)"
         )
-    try:
-        text = file.read_text(encoding="utf-8")
-        table = tomllib.loads(text)
-    except UnicodeDecodeError:
-        raise RecordingError(f"{file.name}: it is not a text in UTF-8; save it as one") from None
-    except tomllib.TOMLDecodeError as problem:
-        raise RecordingError(f"{file.name}: this is not valid TOML: {problem}; mend it") from None
+    text = read_text(file, file.name)
+    table = parse_toml(text, file.name)
     try:
         return parse_model(table, text), text
     except RecordingError as problem:
-        raise RecordingError(str(problem).replace("recording.toml", file.name, 1)) from None
+        raise in_file(problem, file.name) from None
 
 
 def _required(folder: Path, name: str) -> Table:
@@ -174,9 +169,8 @@ def _point_rows(table: Table, model: Model, target: np.ndarray, plane: bool) -> 
     table.check(
         point > -2,
         lambda row: (
-            f'point "{names[row]}" is not on target '
-            f'"{model.targets[target[row]].name}" {has(known[target[row]])}; '
-            f"{did_you_mean(str(names[row]), known[target[row]])}"
+            f'point "{names[row]}" is not on target "{model.targets[target[row]].name}" '
+            f"{has_not(str(names[row]), known[target[row]])}"
         ),
     )
     return point
@@ -232,8 +226,8 @@ def _drivers(table: Table | None, model: Model, time: np.ndarray, timed: bool) -
         if name not in channels:
             raise table.error(
                 None,
-                f'column "{name}" is missing, which recording.toml describes {has(channels)}; '
-                f"{did_you_mean(name, channels)}",
+                f'column "{name}" is missing, which recording.toml describes '
+                f"{has_not(name, channels)}",
             )
     for name in ("constant", "time"):
         if name in channels:
@@ -300,8 +294,7 @@ def _links(table: Table | None, model: Model, ids: np.ndarray) -> Links | None:
             if name not in place[kind]:
                 raise table.error(
                     row,
-                    f'{column}: there is no {kind} "{name}" {has(bodies[kind])}; '
-                    f"{did_you_mean(name, bodies[kind])}",
+                    f'{column}: there is no {kind} "{name}" {has_not(name, bodies[kind])}',
                 )
             nodes[column].append((kind, place[kind][name]))
     covariance = _covariances(table) if full else _of_sigmas(table)

@@ -1,5 +1,6 @@
 """Tables of a recording, from csv or parquet, with the line of every row kept for errors."""
 
+import re
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -7,7 +8,10 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float, Int
 
-from jaxvm.recording.errors import RecordingError, did_you_mean, has
+from jaxvm.recording.errors import RecordingError, did_you_mean, has, has_not
+from jaxvm.recording.texts import not_utf8
+
+_RAGGED = re.compile(r"Expected (\d+) fields in line (\d+), saw (\d+)")
 
 
 class Table:
@@ -86,8 +90,7 @@ class Table:
         self.check(
             place >= 0,
             lambda row: (
-                f'{column} "{texts[row]}" is not in {where} {has(known)}; '
-                f"{did_you_mean(str(texts[row]), known)}"
+                f'{column} "{texts[row]}" is not in {where} {has_not(str(texts[row]), known)}'
             ),
         )
         return place
@@ -119,28 +122,55 @@ def read_table(folder: Path, name: str, required: bool) -> Table | None:
                 f"{name}.csv: there is no such file in {folder}; add {name}.csv or {name}.parquet"
             )
         return None
+    return read_csv(csv)
+
+
+def read_csv(file: Path) -> Table:
+    """A table from a csv: fields with commas, numbers with points, in UTF-8.
+
+    Raises:
+        RecordingError: it is empty, or no such table; names the line.
+    """
     try:
+        with file.open(encoding="utf-8-sig") as lines:
+            _commas(file.name, lines.readline())
         # Everything as text: a wrong number is then found with its line, whatever it is.
         frame = pd.read_csv(
-            csv, dtype=str, keep_default_na=False, na_filter=False, skip_blank_lines=False,
+            file, dtype=str, keep_default_na=False, na_filter=False, skip_blank_lines=False,
             skipinitialspace=True, encoding="utf-8-sig",
         )  # fmt: skip
     except pd.errors.EmptyDataError:
-        raise RecordingError(f"{csv.name} line 1: the file is empty; write a header") from None
-    except (pd.errors.ParserError, UnicodeDecodeError) as problem:
+        raise RecordingError(f"{file.name} line 1: the file is empty; write a header") from None
+    except UnicodeDecodeError:
+        raise not_utf8(file, file.name) from None
+    except pd.errors.ParserError as problem:
+        ragged = _RAGGED.search(str(problem))
+        place = f" line {ragged[2]}" if ragged else ""
+        said = f"{ragged[3]} fields, the header {ragged[1]}" if ragged else _first_line(problem)
         raise RecordingError(
-            f"{csv.name}: {_first_line(problem)}; every line needs as many fields as the header"
+            f"{file.name}{place}: {said}; every line needs as many fields as the header"
         ) from None
     if not isinstance(frame.index, pd.RangeIndex):
         raise RecordingError(
-            f"{csv.name} line 2: it has more fields than the header; name every column"
+            f"{file.name} line 2: it has more fields than the header; name every column, and write "
+            "numbers with a decimal point"
         )
     frame.columns = [str(column).strip() for column in frame.columns]
     line = np.arange(len(frame)) + 2
     # Short rows are filled with NaN by the parser even without a filter for NaN.
     frame = frame.fillna("")
     filled = (frame != "").any(axis=1).to_numpy()
-    return Table(csv.name, frame.loc[filled].reset_index(drop=True), line[filled])
+    return Table(file.name, frame.loc[filled].reset_index(drop=True), line[filled])
+
+
+def _commas(file: str, header: str) -> None:
+    """Refuse what spreadsheets of many countries write: there the comma is the decimal sign."""
+    for sign, word in ((";", '";"'), ("\t", "tabs")):
+        if sign in header and "," not in header:
+            raise RecordingError(
+                f"{file} line 1: its fields are separated by {word}; save it with commas between "
+                "fields, and decimal points in numbers"
+            )
 
 
 def _shown(value) -> str:

@@ -79,7 +79,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxvm.recording.entries import Entry
-from jaxvm.recording.errors import RecordingError
+from jaxvm.recording.errors import RecordingError, in_file
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,8 +189,3 @@ class Description:
     def error_at(self, entry: Entry, key: str | None, problem: str) -> RecordingError:
         """Error at a key of an entry of the file (None: at the entry itself)."""
         return in_file(entry.error(key, problem), self.file)
-
-
-def in_file(problem: RecordingError, file: str) -> RecordingError:
-    """The error of `Entry`, which knows one file only, with the name of this one."""
-    return RecordingError(str(problem).replace("recording.toml", file))

@@ -1,13 +1,12 @@
 """The text of a network's TOML into its description: what every key may be, and its default."""
 
-import tomllib
-
 import numpy as np
 
 from jaxvm.physics.ports import PORTS
 from jaxvm.recording.entries import Entry
-from jaxvm.recording.errors import RecordingError, did_you_mean
+from jaxvm.recording.errors import RecordingError, did_you_mean, in_file
 from jaxvm.recording.model import LENSES
+from jaxvm.recording.texts import parse_toml
 from jaxvm.scenes.deform import MODES
 from jaxvm.scenes.describe import (
     Cameras,
@@ -16,7 +15,6 @@ from jaxvm.scenes.describe import (
     Marks,
     Temperature,
     ThermalEffect,
-    in_file,
 )
 from jaxvm.scenes.layouts import LAYOUTS
 
@@ -33,10 +31,7 @@ def parse_description(text: str, file: str = "scene.toml") -> Description:
     Raises:
         RecordingError: something in it is wrong; names the file, the line and the mend.
     """
-    try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as problem:
-        raise RecordingError(f"{file}: this is not valid TOML: {problem}; mend it") from None
+    table = parse_toml(text, file)
     try:
         return _description(Entry(table, text), file)
     except RecordingError as problem:

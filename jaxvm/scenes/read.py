@@ -4,6 +4,7 @@ from importlib import resources
 from pathlib import Path
 
 from jaxvm.recording.errors import RecordingError
+from jaxvm.recording.texts import read_text
 from jaxvm.scenes.describe import Description
 from jaxvm.scenes.parse import parse_description
 
@@ -42,7 +43,4 @@ def description_text(scene: str | Path) -> str:
             f"{name}: there is no such file, and no example of that name ({known}); "
             'write one, `layout = "chain"` is enough'
         )
-    try:
-        return path.read_text(encoding="utf-8")
-    except UnicodeDecodeError:
-        raise RecordingError(f"{path.name}: it is not a text in UTF-8; save it as one") from None
+    return read_text(path, path.name)
