@@ -146,8 +146,13 @@ def test_convert_between_tables(tmp_path):
 
 def test_convert_needs_what_a_file_does_not_tell(corners, tmp_path):
     corners.to_csv(tmp_path / "corners.csv", index=False)
-    with pytest.raises(RecordingError, match="does not tell the image size; give it"):
+    with pytest.raises(RecordingError, match="the image size; give it with --image-size WxH$"):
         convert(tmp_path / "corners.csv", tmp_path / "out")
+    with pytest.raises(RecordingError, match="corners; give it with --spacing METRES$"):
+        convert(tmp_path / "corners.csv", tmp_path / "out", image_size=(640, 480))
+    for name in ("nowhere.csv", "nowhere.vnl", "nowhere.txt", "nowhere.bin", "nowhere.yml"):
+        with pytest.raises(RecordingError, match=f"{name}: there is no such file; .+"):
+            convert(tmp_path / name, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 

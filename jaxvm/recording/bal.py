@@ -112,7 +112,7 @@ def write_bal(
 def _numbers(file: Path):
     """Cameras [c, 9], points [p, 3] and observations [n, 4]."""
     if not file.is_file():
-        raise RecordingError(f"{file}: there is no such file")
+        raise RecordingError(f"{file}: there is no such file; mend the name")
     try:
         with gzip.open(file, "rt") if file.suffix == ".gz" else open(file) as stream:
             words = stream.read().split()

@@ -22,6 +22,9 @@ from jaxvm.recording.read import read_recording
 from jaxvm.recording.recording import Recording
 from jaxvm.recording.write import write_recording
 
+_SIZE = "the image size", "--image-size WxH"
+_SPACING = "the spacing of its corners", "--spacing METRES"
+
 
 def convert(
     source: str | Path,
@@ -52,9 +55,12 @@ def convert(
     path = Path(source)
     kind = "folder" if path.is_dir() else path.suffix.lower()
 
-    def needed(value, option: str):
+    def needed(value, what: str, option: str):
+        # Of a file that is not there nothing else is missing.
+        if not path.is_file():
+            raise RecordingError(f"{source}: there is no such file; mend the name")
         if value is None:
-            raise RecordingError(f"{path.name}: it does not tell {option}; give it")
+            raise RecordingError(f"{path.name}: it does not tell {what}; give it with {option}")
         return value
 
     if kind in (".yml", ".yaml", ".xml"):
@@ -68,15 +74,16 @@ def convert(
     elif kind == "folder":
         recording = read_recording(path)
     elif kind == ".csv":
-        size = needed(image_size, "the image size")
-        recording = import_corner_table(path, size, needed(spacing_m, "the spacing (m)"), lens)
+        recording = import_corner_table(
+            path, needed(image_size, *_SIZE), needed(spacing_m, *_SPACING), lens
+        )
     elif kind == ".vnl":
         recording = import_corners_vnl(
             path,
-            needed(rows, "the number of rows"),
-            needed(columns, "the number of columns"),
-            needed(spacing_m, "the spacing (m)"),
-            {"camera": needed(image_size, "the image size")},
+            needed(rows, "the number of rows", "--rows"),
+            needed(columns, "the number of columns", "--columns"),
+            needed(spacing_m, *_SPACING),
+            {"camera": needed(image_size, *_SIZE)},
             lens=lens,
         )
     elif path.name.endswith((".g2o", ".g2o.gz")):

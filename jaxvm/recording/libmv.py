@@ -135,7 +135,7 @@ def _turns(cameras: np.ndarray) -> Rotation:
 
 def _read(file: Path) -> _Problem:
     if not file.is_file():
-        raise RecordingError(f"{file}: there is no such file")
+        raise RecordingError(f"{file}: there is no such file; mend the name")
     data = file.read_bytes()
     order: Literal["<", ">"] = "<" if data[:1] == b"v" else ">"
     if data[:1] not in (b"v", b"V") or data[1:2] not in (b"P", b"N"):
