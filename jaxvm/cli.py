@@ -128,6 +128,7 @@ def _parser() -> argparse.ArgumentParser:
     diagnose = command("diagnose", "find the physics that a model left out")
     diagnose.add_argument(
         "recording",
+        type=_named,
         nargs="+",
         help=f"{_RECORDING}; several are diagnosed one by one",
     )
@@ -136,6 +137,7 @@ def _parser() -> argparse.ArgumentParser:
         "--with",
         dest="further",
         action="append",
+        type=_named,
         default=[],
         metavar="RECORDING",
         help="a further recording of the same cameras and bodies, diagnosed together with it",
@@ -178,15 +180,16 @@ def _parser() -> argparse.ArgumentParser:
     )
 
     compensate = command("compensate", "take drift off the pixels of a recording")
-    compensate.add_argument("recording", help="folder of a recording")
+    compensate.add_argument("recording", type=_named, help="folder of a recording")
     compensate.add_argument(
-        "--model", type=Path, required=True, metavar="FILE", help="what jaxvm identify wrote"
+        "--model", type=_path, required=True, metavar="FILE", help="what jaxvm identify wrote"
     )
     _out_argument(compensate, "new", required=True, metavar="RECORDING")
 
     simulate = command("simulate", "write a simulated recording")
     simulate.add_argument(
         "scene",
+        type=_named,
         help='"deformation" (a world of its own, where physics is hidden), a network of the '
         "examples by its name (ship, tunnel, bridge, wind-tunnel, chain, double-chain, ring, "
         "station, random), or a TOML that describes one",
@@ -195,7 +198,7 @@ def _parser() -> argparse.ArgumentParser:
     simulate.add_argument("--seed", type=_natural, default=0, help="of the noise")
     simulate.add_argument(
         "--truth",
-        type=Path,
+        type=_path,
         default=None,
         metavar="DIR",
         help='networks: folder for what is true; beside the recording, with "-truth"',
@@ -213,7 +216,9 @@ def _parser() -> argparse.ArgumentParser:
     montecarlo = command(
         "montecarlo", "adjust a simulated network many times: errors against theory"
     )
-    montecarlo.add_argument("scene", help="as for simulate: an example by its name, or a TOML")
+    montecarlo.add_argument(
+        "scene", type=_named, help="as for simulate: an example by its name, or a TOML"
+    )
     montecarlo.add_argument("--trials", type=_positive, default=1000)
     montecarlo.add_argument(
         "--batch", type=_positive, default=None, help="trials at a time; found by measuring"
@@ -239,6 +244,7 @@ def _parser() -> argparse.ArgumentParser:
     convert = command("convert", "make a recording of other programs' files")
     convert.add_argument(
         "source",
+        type=_named,
         help="table of corners (.csv), mrcal's corners (.vnl) or .cameramodel, OpenCV's "
         "calibration (.yml, .xml), a pose graph (.g2o, .g2o.gz), a problem of bundle adjustment "
         "(.txt, .txt.gz, libmv's .bin), the folder of a recording, or the name of a public one",
@@ -262,16 +268,13 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _recording_argument(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "recording",
-        help=_RECORDING,
-    )
+    parser.add_argument("recording", type=_named, help=_RECORDING)
     _model_argument(parser)
 
 
 def _model_argument(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--model", type=Path, default=None, metavar="FILE", help="in place of its recording.toml"
+        "--model", type=_path, default=None, metavar="FILE", help="in place of its recording.toml"
     )
 
 
@@ -279,8 +282,19 @@ def _out_argument(
     parser: argparse.ArgumentParser, writes: str, default: str | None = None, **words: Any
 ) -> None:
     """`writes`: a kind of `jaxvm.recording.files.Place`."""
-    parser.add_argument("--out", type=Path, default=default and Path(default), **words)
+    parser.add_argument("--out", type=_path, default=default and Path(default), **words)
     parser.set_defaults(writes=writes)
+
+
+def _named(text: str) -> str:
+    """A name; an empty one would be the folder one is in."""
+    if not text.strip():
+        raise argparse.ArgumentTypeError("the name is empty; give the name of a file or folder")
+    return text
+
+
+def _path(text: str) -> Path:
+    return Path(_named(text))
 
 
 def _natural(text: str) -> int:

@@ -298,3 +298,53 @@ def test_the_folders_of_several_reports_are_refused_before_any_work(tmp_path, ca
     (tmp_path / "b").touch()
     assert main(["diagnose", "a", "b", "--out", str(tmp_path)]) == 2
     assert "b is a file, not a folder" in capsys.readouterr().err
+
+
+def test_a_model_of_another_recording_is_named(board, tmp_path, capsys):
+    """Whatever it lacks is told of the file that was given, not of the recording's own."""
+    own = (board / "recording.toml").read_text()
+    other = tmp_path / "x.toml"
+    for change, words in (
+        (("cameras.cam", "cameras.left"), "its cameras are left, the recording's cam; give"),
+        (("targets.board", "targets.b"), "its targets are b, the recording's board; give"),
+        (("rows = 5", "rows = 4"), 'target "board" has other points'),
+        (("lens = ", "lense = "), 'unknown key "lense"'),
+        (("format = 1", "format = "), "this is not valid TOML"),
+    ):
+        assert change[0] in own
+        other.write_text(own.replace(*change))
+        assert main(["validate", str(board), "--model", str(other)]) == 2
+        said = capsys.readouterr().err
+        assert said.startswith(f"jaxvm validate: {other}") and words in said, said
+        assert "recording.toml" not in said and said.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["board", "--model", "no.toml"], "no.toml: there is no such file; give the model.toml"),
+        (["board", "--model", "board"], "board is a folder; give the model.toml in it"),
+        (
+            ["board/epochs.csv"],
+            "board/epochs.csv is a file; a recording is a folder, give that: bo",
+        ),
+        (["afile"], "afile is a file; a recording is a folder, give that with recording.toml"),
+    ],
+)
+def test_what_is_no_recording_is_told(arguments, words, board, capsys, monkeypatch):
+    monkeypatch.chdir(board.parent)
+    (board.parent / "afile").touch()
+    assert main(["validate", *arguments]) == 2
+    assert f"jaxvm validate: {words}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "arguments", [["validate", ""], ["adjust", "a", "--out", ""], ["adjust", "a", "--model", ""]]
+)
+def test_an_empty_name_is_refused(arguments, board, capsys, monkeypatch):
+    """It would be the folder one is in."""
+    monkeypatch.chdir(board)
+    with pytest.raises(SystemExit) as stopped:
+        main(arguments)
+    assert stopped.value.code == 2
+    assert "the name is empty; give the name of a file or folder" in capsys.readouterr().err

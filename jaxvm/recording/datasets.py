@@ -9,8 +9,7 @@ import pooch
 
 from jaxvm.recording.errors import RecordingError
 from jaxvm.recording.importers import import_cameramodel, import_corner_table
-from jaxvm.recording.model import Model
-from jaxvm.recording.read import read_model
+from jaxvm.recording.read import check_same_bodies, read_model
 from jaxvm.recording.recording import Recording
 
 _MRCAL = (
@@ -77,7 +76,7 @@ def open_recording(name: str, model: str | Path | None = None) -> Recording:
     if model is None:
         return recording
     parsed, _ = read_model(model)
-    _same_bodies(recording, parsed, Path(model).name)
+    check_same_bodies(recording.model, parsed, str(model))
     return replace(recording, model=parsed)
 
 
@@ -95,19 +94,3 @@ def _open(name: str) -> Recording:
             f"{dataset.local} into a folder and name that folder in JAXVM_DATA"
         ) from None
     return dataset.read_published(Path(file))
-
-
-def _same_bodies(recording: Recording, model: Model, file: str) -> None:
-    for kind in ("cameras", "targets"):
-        own, other = ([b.name for b in getattr(m, kind)] for m in (recording.model, model))
-        if own != other:
-            raise RecordingError(
-                f"{file}: its {kind} are {', '.join(other)}, the recording's {', '.join(own)}; "
-                "give a model of this recording"
-            )
-    for own, other in zip(recording.model.targets, model.targets, strict=True):
-        if own.point_names != other.point_names:
-            raise RecordingError(
-                f'{file}: target "{own.name}" has other points than in the recording; '
-                "give a model of this recording"
-            )

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxvm.recording.check import check_recording
-from jaxvm.recording.errors import RecordingError, has_not, in_file
+from jaxvm.recording.errors import RecordingError, has_not, in_file, listed
 from jaxvm.recording.model import Model
 from jaxvm.recording.parse import known_link, parse_model
 from jaxvm.recording.recording import (
@@ -21,6 +21,7 @@ from jaxvm.recording.tables import Table, read_table
 from jaxvm.recording.texts import parse_toml, read_text
 from jaxvm.recording.write import COVARIANCES, RATES
 
+_MODEL = "recording.toml"
 _POSE = ("turn_x", "turn_y", "turn_z", "shift_x", "shift_y", "shift_z")
 
 
@@ -37,10 +38,24 @@ def read_recording(folder: str | Path, model: str | Path | None = None) -> Recor
             names the file, the line and the mend.
     """
     folder = Path(folder)
+    if folder.is_file():
+        beside = f": {folder.parent}" if (folder.parent / _MODEL).is_file() else f" with {_MODEL}"
+        raise RecordingError(f"{folder} is a file; a recording is a folder, give that{beside}")
     if not folder.is_dir():
         raise RecordingError(f"{folder}: there is no such folder; give the folder of a recording")
-    file = folder / "recording.toml" if model is None else Path(model)
-    parsed, text = read_model(file)
+    if model is None:
+        return _recording(folder, *read_model(folder / _MODEL))
+    given, text = read_model(model)
+    try:
+        return _recording(folder, given, text)
+    except RecordingError as problem:
+        if (folder / _MODEL).is_file():
+            check_same_bodies(read_model(folder / _MODEL)[0], given, str(model))
+        raise in_file(problem, str(model)) from None
+
+
+def _recording(folder: Path, parsed: Model, text: str) -> Recording:
+    """The recording in a folder, with a model (whose text tells lines) that is read already."""
     if parsed.cameras:
         ids, time, timed, velocities = _epochs(_required(folder, "epochs"), parsed)
         observed = _required(folder, "observations")
@@ -79,16 +94,48 @@ def read_model(file: str | Path) -> tuple[Model, str]:
     """
     file = Path(file)
     if not file.is_file():
-        raise RecordingError(
-            f"{file.name}: there is no such file in {file.parent}; write one with the cameras and "
-            "targets (the README shows an example)"
-        )
-    text = read_text(file, file.name)
-    table = parse_toml(text, file.name)
+        raise RecordingError(_no_model(file))
+    name = _MODEL if file.name == _MODEL else str(file)
+    text = read_text(file, name)
+    table = parse_toml(text, name)
     try:
         return parse_model(table, text), text
     except RecordingError as problem:
-        raise in_file(problem, file.name) from None
+        raise in_file(problem, name) from None
+
+
+def _no_model(file: Path) -> str:
+    """What to say of a model that is not there; the one of a folder the engineer has to write."""
+    if file.is_dir():
+        return f"{file} is a folder; give the model.toml in it"
+    if file.name == _MODEL:
+        return (
+            f"{file.name}: there is no such file in {file.parent}; write one with the cameras and "
+            "targets (the README shows an example)"
+        )
+    return f"{file}: there is no such file; give the model.toml that adjust or diagnose wrote"
+
+
+def check_same_bodies(own: Model, given: Model, file: str) -> None:
+    """Check that a model that was given in place of a recording's own is of the same bodies.
+
+    Raises:
+        RecordingError: names of cameras, targets or points differ, or their order, by which the
+            measurements know them; `file` is where they stand.
+    """
+    for kind in ("cameras", "targets"):
+        ours, theirs = ([body.name for body in getattr(m, kind)] for m in (own, given))
+        if ours != theirs:
+            raise RecordingError(
+                f"{file}: its {kind} are {listed(theirs)}, the recording's {listed(ours)}; "
+                "give a model of this recording"
+            )
+    for ours, theirs in zip(own.targets, given.targets, strict=True):
+        if ours.point_names != theirs.point_names:
+            raise RecordingError(
+                f'{file}: target "{ours.name}" has other points than in the recording; '
+                "give a model of this recording"
+            )
 
 
 def _required(folder: Path, name: str) -> Table:
