@@ -23,8 +23,20 @@ def _progress(options) -> Callable[[str], None]:
     return line
 
 
-def _open(name: str, model: Path | None = None):
-    """The recording that a command is about: a folder, or a public one by name."""
+def _open(name: str, model: Path | None, tell: Callable[[str], None]):
+    """The recording that a command is about: a folder, or a public one by name.
+
+    `tell` hears what is odd in it.
+    """
+    from jaxvm.recording import hints
+
+    recording = _recording(name, model)
+    for hint in hints(recording):
+        tell(f"hint: {hint}")
+    return recording
+
+
+def _recording(name: str, model: Path | None):
     from jaxvm.recording import DATASETS, open_recording, read_recording
     from jaxvm.recording.g2o import import_g2o
 
@@ -89,9 +101,9 @@ def _diagnose_one(options, name: str, out: Path):
     from jaxvm.recording import join
 
     progress = _progress(options)
-    recording = _open(name, options.model)
+    recording = _open(name, options.model, progress)
     for further in options.further:
-        recording = join(recording, _open(further))
+        recording = join(recording, _open(further, None, progress))
     found = diagnose(
         recording, every=options.every, alpha=options.alpha, seed=options.seed, progress=progress
     )
@@ -114,7 +126,7 @@ def run_adjust(options):
 
     progress = _progress(options)
     progress("start values from the data")
-    scene = start(build(_open(options.recording, options.model)), options.start)
+    scene = start(build(_open(options.recording, options.model, progress)), options.start)
     progress("adjustment")
     rejected = []
     if options.snoop:
@@ -165,8 +177,9 @@ def run_identify(options):
     from jaxvm.identify import identify
     from jaxvm.recording.files import write_files
 
-    recording = _open(options.recording, options.model)
-    found = identify(recording, one_step=not options.two_steps, progress=_progress(options))
+    progress = _progress(options)
+    recording = _open(options.recording, options.model, progress)
+    found = identify(recording, one_step=not options.two_steps, progress=progress)
     write_files(options.out.absolute().parent, {options.out.name: found.model.text()})
     answer = {"model": str(options.out), "cameras": [own.as_dict() for own in found.cameras]}
     return answer, f"{found.summary()}\n\nwritten    {options.out}"
@@ -178,7 +191,8 @@ def run_compensate(options):
     from jaxvm.recording import write_recording
 
     progress = _progress(options)
-    recording, model = _open(options.recording), read_drift_model(options.model)
+    model = read_drift_model(options.model)
+    recording = _open(options.recording, None, progress)
     found = compensate(recording, model)
     progress("poses before and after")
     poses = {
@@ -332,7 +346,9 @@ def run_convert(options):
 
 
 def run_validate(options):
-    from jaxvm.recording import describe
+    from jaxvm.recording import describe, hints
 
-    told = describe(_open(options.recording, options.model))
-    return {"valid": True, "contents": told}, f"valid      {told}"
+    recording = _recording(options.recording, options.model)
+    told, found = describe(recording), hints(recording)
+    text = "\n".join([f"valid      {told}", *(f"hint       {hint}" for hint in found)])
+    return {"valid": True, "contents": told, "hints": found}, text

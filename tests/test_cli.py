@@ -9,6 +9,8 @@ import sys
 import time
 from dataclasses import replace
 
+import numpy as np
+import pandas as pd
 import pytest
 from networks import board_recording
 from pose_networks import network
@@ -30,6 +32,20 @@ def test_validate(board, capsys):
     assert "1 camera(s)" in capsys.readouterr().out
     assert main(["validate", str(board), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["valid"] is True
+
+
+def test_what_is_odd_in_a_recording_is_hinted_at(board, capsys):
+    """It is valid and adjusted all the same."""
+    times = pd.read_csv(board / "epochs.csv")["t"]
+    log = pd.DataFrame({"t": times, "air": 20.0 + np.arange(len(times))})
+    log.to_csv(board / "drivers.csv", index=False)
+    words = "drivers have no unit at the end of air"
+    assert main(["validate", str(board)]) == 0
+    assert f"hint       {words}" in capsys.readouterr().out
+    assert main(["validate", str(board), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["hints"][0].startswith(words)
+    assert main(["adjust", str(board)]) == 0
+    assert f"hint: {words}" in capsys.readouterr().err
 
 
 def test_adjust_and_its_model(board, tmp_path, capsys):

@@ -11,7 +11,15 @@ from networks import board_recording, relay_recording, stereo_recording
 from jaxvm.physics.catalogue.entry import each
 from jaxvm.physics.catalogue.maps import fine_plate_map, image_map
 from jaxvm.physics.effects import Effect, Scope, Term
-from jaxvm.recording import RecordingError, model_text, read_model, read_recording, write_recording
+from jaxvm.recording import (
+    RecordingError,
+    describe,
+    hints,
+    model_text,
+    read_model,
+    read_recording,
+    write_recording,
+)
 from jaxvm.recording.files import new_folder, write_files
 from jaxvm.simulate import simulate_deformation_scene
 
@@ -261,6 +269,31 @@ def test_wrong_links(change, message, tmp_path):
     change(folder)
     with pytest.raises(RecordingError, match=message):
         read_recording(folder)
+
+
+def test_a_log_in_milliseconds_is_hinted_at(folder):
+    edit("drivers", lambda f: f.assign(t=(1000 * f.t.astype(float)).astype(str)))(folder)
+    (hint,) = hints(read_recording(folder))
+    assert re.search(r"drivers run for 9\d+ h, epochs for 6\.\d+ h; .* by 1000", hint), hint
+
+
+def test_a_channel_without_a_unit_is_hinted_at(folder):
+    def rename(name):
+        return name.replace("ambient_degC", "air").replace("humidity_pct", "wet")
+
+    edit("drivers", lambda f: f.rename(columns=rename))(folder)
+    toml(r"\[drivers.ambient_degC\]", "[drivers.air]")(folder)
+    toml(r"\[drivers.humidity_pct\]", "[drivers.wet]")(folder)
+    (hint,) = hints(read_recording(folder))
+    assert re.search(r"no unit at the end of air, wet.* names no physics; rename .*air_degC", hint)
+
+
+def test_epochs_that_show_nothing_are_counted(folder):
+    assert "40 epochs over 6.50 h;" in describe(read_recording(folder))
+    assert hints(read_recording(folder)) == []
+    edit("observations", lambda f: f[f.epoch.astype(int) < 5])(folder)
+    said = describe(read_recording(folder))
+    assert "40 epochs over 6.50 h, 35 of them without an image point;" in said
 
 
 def test_effect_needs_its_driver(folder):

@@ -7,6 +7,7 @@ A recording is a folder with `recording.toml` (cameras, stations, targets, what 
 from jaxvm.recording.convert import convert, describe
 from jaxvm.recording.datasets import DATASETS, find_data, open_recording
 from jaxvm.recording.errors import RecordingError
+from jaxvm.recording.hints import hints
 from jaxvm.recording.importers import (
     board_recording,
     import_cameramodel,
@@ -55,6 +56,7 @@ __all__ = [
     "convert",
     "describe",
     "find_data",
+    "hints",
     "import_cameramodel",
     "import_corner_table",
     "import_corners_vnl",

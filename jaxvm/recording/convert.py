@@ -10,6 +10,7 @@ from jaxvm.recording.datasets import DATASETS, open_recording
 from jaxvm.recording.errors import RecordingError
 from jaxvm.recording.files import new_folder
 from jaxvm.recording.g2o import import_g2o, write_g2o
+from jaxvm.recording.hints import unseen_epochs
 from jaxvm.recording.importers import (
     import_cameramodel,
     import_corner_table,
@@ -119,6 +120,8 @@ def describe(recording: Recording) -> str:
     ]
     if recording.timed and len(recording.time) > 1:
         parts[2] += f" over {(recording.time[-1] - recording.time[0]) / 3600.0:.2f} h"
+    if model.cameras and (unseen := unseen_epochs(recording)):
+        parts[2] += f", {unseen} of them without an image point"
     if recording.drivers is not None:
         parts.append(f"drivers {', '.join(recording.drivers.channels)}")
     if recording.ranges is not None:
