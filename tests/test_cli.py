@@ -267,7 +267,12 @@ def test_monte_carlo_of_a_described_network(tmp_path, capsys):
     said = capsys.readouterr()
     assert "350 of 350 trials" in said.err and "100 of" not in said.err
     assert main([*asked, "--noise", "student-t:5"]) == 2
-    assert "another study (study differ)" in capsys.readouterr().err
+    assert "of another study (another noise: normal, not student-t:5)" in capsys.readouterr().err
+    assert main([*asked, "--seed", "3"]) == 2
+    assert "of another study (another seed: 0, not 3); ask" in capsys.readouterr().err
+    scene.write_text('layout = "ring"\nstations = 5\nobserve = "links"\n')
+    assert main(asked) == 2
+    assert "of another study (another scene)" in capsys.readouterr().err
     assert main([*asked, "--noise", "pink"]) == 2
     assert 'no noise "pink"' in capsys.readouterr().err
     with pytest.raises(SystemExit):

@@ -68,15 +68,10 @@ class Store:
         place = self.folder / _MANIFEST
         if place.exists():
             there = json.loads(place.read_text(encoding="utf-8"))
-            other = [
-                name
-                for name in sorted(there.keys() | self.manifest.keys())
-                if name != "versions" and there.get(name) != self.manifest.get(name)
-            ]
-            if other:
+            if other := _differences(there, self.manifest):
                 raise FileExistsError(
-                    f"{place}: the trials here are of another study ({', '.join(other)} differ); "
-                    "choose another folder, or remove this one"
+                    f"{self.folder}: the trials here are of another study ({', '.join(other)}); "
+                    "ask for the same, choose another folder, or remove this one"
                 )
         elif self.folder.is_dir() and any(self.folder.iterdir()):
             raise FileExistsError(
@@ -122,6 +117,28 @@ class Store:
                 ) from error
             columns = {n: table[n].to_numpy(zero_copy_only=False) for n in table.column_names}
             yield trial_of(columns)
+
+
+def _differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[str]:
+    """What makes a study another one, in words."""
+    theirs, ours = _parts(there), _parts(here)
+    differ = [name for name in {**ours, **theirs} if theirs.get(name) != ours.get(name)]
+    # Numbers are a fingerprint, which differs with whatever else does.
+    told = [name for name in differ if name != "numbers"] or differ
+    values = {name: (str(theirs.get(name)), str(ours.get(name))) for name in told}
+    return [
+        f"another {name}"
+        + ("" if "\n" in one + other or name == "numbers" else f": {one}, not {other}")
+        for name, (one, other) in values.items()
+    ]
+
+
+def _parts(manifest: Mapping[str, Any]) -> dict[str, Any]:
+    """What a study is, part by part, whatever versions computed it."""
+    study, key = manifest.get("study"), manifest.get("key")
+    # The key that JAX makes of a seed is that number in two halves.
+    seed = (key[0] << 32) + key[1] if isinstance(key, list) and len(key) == 2 else key
+    return {"seed": seed, **(study if isinstance(study, dict) else {"study": study})}
 
 
 def versions() -> dict[str, str]:
