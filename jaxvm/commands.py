@@ -237,7 +237,7 @@ def _simulate_network(options):
                 '[[effects]] with model = "hidden"'
             )
     truth = truth_folder(options.out, options.truth)
-    made = simulate_network(read_description(options.scene), options.seed)
+    made = simulate_network(read_description(options.scene, ("deformation",)), options.seed)
     made.write(options.out, truth)
     told, hidden = describe(made.recording), list(made.truth.hidden)
     answer = {

@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxvm.discover import Diagnosis, diagnose
 from jaxvm.recording import read_recording
+from jaxvm.recording.errors import did_you_mean
 from jaxvm.recording.files import write_files
 from jaxvm.report.words import quantity, size, when
 from jaxvm.simulate import HIDEABLE, Truth, simulate_deformation_scene
@@ -27,11 +28,25 @@ class Demonstration:
 
 
 def hidden_keys(hide: str | None, seed: int = 0) -> tuple[str, ...]:
-    """Keys of effects from a text with commas; "nothing" is none, None one drawn by the seed."""
+    """Keys of effects from a text with commas; "nothing" is none, None one drawn by the seed.
+
+    Raises:
+        ValueError: an effect that can't be hidden, "nothing" beside others, or no word at all.
+    """
     if hide is None:
         return (str(np.random.default_rng([seed, 17]).choice(list(HIDEABLE))),)
     keys = tuple(key.strip() for key in hide.split(",") if key.strip())
-    return () if keys == ("nothing",) else keys
+    if keys == ("nothing",):
+        return ()
+    if not keys:
+        raise ValueError('no effect is named; write "nothing" to hide none')
+    if "nothing" in keys:
+        raise ValueError('"nothing" stands alone; drop it, or the effects beside it')
+    for key in keys:
+        if key not in HIDEABLE:
+            mend = did_you_mean(key, (*HIDEABLE, "nothing"))
+            raise ValueError(f'no effect "{key}" can be hidden; {mend}')
+    return keys
 
 
 def demo(
@@ -46,8 +61,9 @@ def demo(
     Raises:
         ValueError: an effect that can't be hidden.
     """
+    hidden = hidden_keys(hide, seed)
     progress("simulating the deformation scene")
-    made = simulate_deformation_scene(hidden_keys(hide, seed), seed, size)
+    made = simulate_deformation_scene(hidden, seed, size)
     folder = Path(out) / "recording"
     write_files(folder, made.files())
     found = diagnose(read_recording(folder), progress=progress)

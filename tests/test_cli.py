@@ -3,6 +3,7 @@
 import gc
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from jaxvm import commands
 from jaxvm.cli import Interruption, main
 from jaxvm.recording import read_recording, write_recording
 from jaxvm.recording.g2o import import_g2o, write_g2o
+from jaxvm.scenes import example_names
 from jaxvm.simulate import HIDEABLE
 
 
@@ -83,6 +85,11 @@ def test_bad_recording(command, board, tmp_path, capsys):
         (["demo", "--hide", "gremlins"], 'no effect "gremlins" can be hidden'),
         (["simulate", "deformation", "--hide", "x", "--out", "o"], 'no effect "x"'),
         (["convert", "nothing.docx", "--out", "o"], "is no folder"),
+        (["demo", "--hide", "focal-drfit"], 'can be hidden; did you mean "focal-drift"?'),
+        (["demo", "--hide", "focal-drift,nothing"], '"nothing" stands alone; drop it'),
+        (["demo", "--hide", ","], 'no effect is named; write "nothing" to hide none'),
+        (["montecarlo", "shp"], 'no example of that name; did you mean "ship"?'),
+        (["simulate", "deformaton", "--out", "o"], 'did you mean "deformation"?'),
     ],
 )
 def test_bad_arguments(arguments, words, tmp_path, capsys, monkeypatch):
@@ -90,6 +97,12 @@ def test_bad_arguments(arguments, words, tmp_path, capsys, monkeypatch):
     assert main([*arguments, "--quiet"] if arguments[0] == "demo" else arguments) == 2
     assert words in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_list_of_examples_holds_what_the_command_takes(capsys):
+    assert main(["montecarlo", "deformation"]) == 2
+    listed = re.search(r"known here: (.*) \(to write", capsys.readouterr().err)
+    assert listed and tuple(listed[1].split(", ")) == example_names()
 
 
 def test_what_the_system_refuses_is_told_without_its_number(board, capsys):

@@ -454,8 +454,10 @@ def test_every_key_is_in_the_one_table(layout):
 
 def test_examples_come_with_the_package():
     assert {read_description(name).layout for name in example_names()} == set(LAYOUTS)
-    with pytest.raises(RecordingError, match="no example of that name .deformation, bridge"):
+    with pytest.raises(RecordingError, match='no example of that name; did you mean "ship"'):
         read_description("shib")
+    with pytest.raises(RecordingError, match="known here: deformation, bridge, chain"):
+        read_description("submarine", ("deformation",))
 
 
 def test_simulate_writes_recording_and_truth_apart(tmp_path, capsys):
