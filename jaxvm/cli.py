@@ -5,6 +5,7 @@ import argparse
 import signal
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -108,22 +109,22 @@ def _parser() -> argparse.ArgumentParser:
     subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     def command(name: str, words: str) -> argparse.ArgumentParser:
-        own = subparsers.add_parser(name, help=words, description=words)
+        own = subparsers.add_parser(name, help=words, description=words, formatter_class=_Defaults)
         own.set_defaults(run=getattr(commands, f"run_{name}"))
         own.add_argument("--json", action="store_true", help="print the answer as JSON")
         own.add_argument("--quiet", action="store_true", help="no progress")
         return own
 
     demo = command("demo", "hide physics in a simulated recording and find it")
-    demo.add_argument("--seed", type=_natural, default=10, help="draws scene, noise and effect")
+    demo.add_argument("--seed", type=_whole(0), default=10, help="draws scene, noise and effect")
     demo.add_argument(
         "--hide",
         default=None,
         metavar="EFFECT",
         help='effects to hide, with commas; "nothing"; drawn by the seed if not given',
     )
-    demo.add_argument("--size", choices=("full", "small"), default="full")
-    _out_argument(demo, "folder", "jaxvm-demo", metavar="DIR")
+    demo.add_argument("--size", choices=("full", "small"), default="full", help="of the recording")
+    _out_argument(demo, "folder", "jaxvm-demo", metavar="DIR", help="recording and report")
 
     diagnose = command("diagnose", "find the physics that a model left out")
     diagnose.add_argument(
@@ -142,21 +143,24 @@ def _parser() -> argparse.ArgumentParser:
         metavar="RECORDING",
         help="a further recording of the same cameras and bodies, diagnosed together with it",
     )
-    _out_argument(diagnose, "folder", "jaxvm-report", metavar="DIR")
+    _out_argument(diagnose, "folder", "jaxvm-report", metavar="DIR", help="report and model")
     diagnose.add_argument(
         "--data-only", action="store_true", help="report.json and model.toml, no page, no figures"
     )
-    diagnose.add_argument("--every", type=_natural, default=3, help="hold out every n-th epoch")
+    diagnose.add_argument("--every", type=_whole(2), default=3, help="hold out every n-th epoch")
     diagnose.add_argument("--alpha", type=float, default=0.01, help="risk of a false claim")
-    diagnose.add_argument("--seed", type=_natural, default=0, help="of sign-flips and bootstrap")
+    diagnose.add_argument("--seed", type=_whole(0), default=0, help="of sign-flips and bootstrap")
 
     adjust = command("adjust", "least-squares adjustment of a recording")
     _recording_argument(adjust)
-    _out_argument(adjust, "folder", metavar="DIR")
+    _out_argument(
+        adjust, "folder", metavar="DIR", help="model, poses, picture; nothing is written without"
+    )
     adjust.add_argument(
         "--method",
         choices=("levenberg-marquardt", "gauss-newton", "spgd", "lbfgs"),
         default="levenberg-marquardt",
+        help="how the cost is minimised",
     )
     adjust.add_argument(
         "--start",
@@ -169,12 +173,15 @@ def _parser() -> argparse.ArgumentParser:
         "--snoop", action="store_true", help="set aside links with gross errors, and name them"
     )
     adjust.add_argument(
-        "--loss", choices=("squared", "huber", "cauchy", "tukey"), default="squared"
+        "--loss",
+        choices=("squared", "huber", "cauchy", "tukey"),
+        default="squared",
+        help="what a residual costs; all but squared hold gross errors down",
     )
 
     identify = command("identify", "identify how cameras drift with temperature")
     _recording_argument(identify)
-    _out_argument(identify, "file", "drift.toml", metavar="FILE")
+    _out_argument(identify, "file", "drift.toml", metavar="FILE", help="the model of the drift")
     identify.add_argument(
         "--two-steps", action="store_true", help="do not refine through the residual of the network"
     )
@@ -184,7 +191,7 @@ def _parser() -> argparse.ArgumentParser:
     compensate.add_argument(
         "--model", type=_path, required=True, metavar="FILE", help="what jaxvm identify wrote"
     )
-    _out_argument(compensate, "new", required=True, metavar="RECORDING")
+    _out_argument(compensate, "new", required=True, metavar="RECORDING", help="a new folder")
 
     simulate = command("simulate", "write a simulated recording")
     simulate.add_argument(
@@ -194,8 +201,14 @@ def _parser() -> argparse.ArgumentParser:
         "examples by its name (ship, tunnel, bridge, wind-tunnel, chain, double-chain, ring, "
         "station, random), or a TOML that describes one",
     )
-    _out_argument(simulate, "new", required=True, metavar="RECORDING")
-    simulate.add_argument("--seed", type=_natural, default=0, help="of the noise")
+    _out_argument(simulate, "new", required=True, metavar="RECORDING", help="a new folder")
+    simulate.add_argument(
+        "--seed",
+        type=_whole(0),
+        default=0,
+        help="draws the noise; of deformation also the scene (its cameras, its weather) and how "
+        "large is what is hidden",
+    )
     simulate.add_argument(
         "--truth",
         type=_path,
@@ -219,11 +232,11 @@ def _parser() -> argparse.ArgumentParser:
     montecarlo.add_argument(
         "scene", type=_named, help="as for simulate: an example by its name, or a TOML"
     )
-    montecarlo.add_argument("--trials", type=_positive, default=1000)
+    montecarlo.add_argument("--trials", type=_whole(1), default=1000, help="how many")
     montecarlo.add_argument(
-        "--batch", type=_positive, default=None, help="trials at a time; found by measuring"
+        "--batch", type=_whole(1), default=None, help="trials at a time; found by measuring"
     )
-    montecarlo.add_argument("--seed", type=_natural, default=0, help="of the noise")
+    montecarlo.add_argument("--seed", type=_whole(0), default=0, help="of the noise")
     montecarlo.add_argument(
         "--noise",
         default="normal",
@@ -233,6 +246,7 @@ def _parser() -> argparse.ArgumentParser:
         "--estimator",
         choices=("gauss-newton", "levenberg-marquardt", "spgd"),
         default="gauss-newton",
+        help="how each trial is adjusted",
     )
     _out_argument(
         montecarlo,
@@ -255,16 +269,30 @@ def _parser() -> argparse.ArgumentParser:
     convert.add_argument(
         "--mend", action="store_true", help="g2o: mend information that is not positive definite"
     )
-    convert.add_argument("--table", choices=("csv", "parquet"), default="csv")
-    convert.add_argument("--image-size", type=_size, default=None, metavar="WxH")
-    convert.add_argument("--spacing", type=float, default=None, metavar="METRES")
-    convert.add_argument("--rows", type=_natural, default=None)
-    convert.add_argument("--columns", type=_natural, default=None)
-    convert.add_argument("--lens", default="opencv8")
+    convert.add_argument(
+        "--table", choices=("csv", "parquet"), default="csv", help="form of the tables"
+    )
+    convert.add_argument(
+        "--image-size", type=_size, default=None, metavar="WxH", help="corners: of the image (px)"
+    )
+    convert.add_argument(
+        "--spacing", type=float, default=None, metavar="METRES", help="corners: to the next one"
+    )
+    for side in ("rows", "columns"):
+        convert.add_argument(f"--{side}", type=_whole(1), help=f"corners.vnl: {side} of the board")
+    convert.add_argument("--lens", default="opencv8", help="corners: lens of the camera")
 
     validate = command("validate", "check a recording and tell what is in it")
     _recording_argument(validate)
     return parser
+
+
+class _Defaults(argparse.ArgumentDefaultsHelpFormatter):
+    """Help that tells what is taken where an option is not given, if anything is."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        none = action.default is None or action.default is False or action.default == []
+        return action.help if none else super()._get_help_string(action)
 
 
 def _recording_argument(parser: argparse.ArgumentParser) -> None:
@@ -297,18 +325,19 @@ def _path(text: str) -> Path:
     return Path(_named(text))
 
 
-def _natural(text: str) -> int:
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{text} is negative")
-    return value
+def _whole(least: int) -> Callable[[str], int]:
+    """Numbers of at least so many."""
 
+    def number(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = least - 1
+        if value < least:
+            raise argparse.ArgumentTypeError(f"{text} is no whole number from {least} on")
+        return value
 
-def _positive(text: str) -> int:
-    value = _natural(text)
-    if value == 0:
-        raise argparse.ArgumentTypeError("it must be at least 1")
-    return value
+    return number
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -105,6 +105,38 @@ def test_a_list_of_examples_holds_what_the_command_takes(capsys):
     assert listed and tuple(listed[1].split(", ")) == example_names()
 
 
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["demo", "--seed", "x"], "argument --seed: x is no whole number from 0 on"),
+        (["demo", "--seed", "-1"], "argument --seed: -1 is no whole number from 0 on"),
+        (["diagnose", "a", "--every", "1"], "argument --every: 1 is no whole number from 2 on"),
+        (["montecarlo", "ship", "--trials", "0"], "argument --trials: 0 is no whole number from 1"),
+    ],
+)
+def test_wrong_numbers_are_told_with_what_is_wanted(arguments, words, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(arguments)
+    assert stopped.value.code == 2 and words in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("command", "defaults"),
+    [
+        ("adjust", ["auto", "levenberg-marquardt", "squared"]),
+        ("diagnose", ["jaxvm-report", "3", "0.01", "0"]),
+        ("demo", ["10", "full", "jaxvm-demo"]),
+        ("validate", []),
+    ],
+)
+def test_help_tells_defaults(command, defaults, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    told = re.findall(r"\(default: (.*?)\)", capsys.readouterr().out)
+    assert sorted(told) == sorted(defaults)
+
+
 def test_what_the_system_refuses_is_told_without_its_number(board, capsys):
     (board / "drivers.csv").mkdir()
     assert main(["validate", str(board)]) == 2
