@@ -364,6 +364,8 @@ def test_a_stopped_run_goes_on(tmp_path, scene):
     assert again.ran == 0 and again.statistics.count == 60
     fewer = run(study, 4, 30, folder=tmp_path)
     assert fewer.ran == 0 and fewer.statistics.count == len(fewer.errors) == 30
+    said = fewer.summary()
+    assert said.endswith(", of which failed 0; all of them were there already, none was run")
 
 
 def test_an_interrupted_run_keeps_what_is_done(tmp_path, scene):

@@ -96,13 +96,14 @@ class Results:
 
     def summary(self) -> str:
         """A few lines."""
-        ran = max(self.seconds - self.compiling, 1e-9)
-        return "\n".join(
-            [
-                f"trials             {self.done} of {self.trials}, of which failed {self.failed}",
-                f"time               {self.seconds:.2f} s, of which compiling"
-                f" {self.compiling:.2f} s; batches of {self.batch}, {self.ran / ran:.4g} a second",
-            ]
+        trials = f"trials             {self.done} of {self.trials}, of which failed {self.failed}"
+        if self.ran == 0:
+            return f"{trials}; all of them were there already, none was run"
+        running = max(self.seconds - self.compiling, 1e-9)
+        rate = self.ran / running
+        return (
+            f"{trials}\ntime               {self.seconds:.2f} s, of which compiling"
+            f" {self.compiling:.2f} s; batches of {self.batch}, {rate:.4g} a second"
         )
 
     def to_xarray(self):
