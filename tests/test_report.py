@@ -27,6 +27,8 @@ def test_a_mistake_is_no_physics_and_physics_no_mistake(tmp_path):
     pixel[same] += [2.0, 0.0]
     found = diagnose(replace(recording, observations=replace(obs, pixel=pixel)))
     assert found.n_rejected == 0 and found.findings, summary(found)
+    # What a report shows is measured minus predicted, as its page says.
+    assert np.mean(found.before.residual[same & found.before.used, 0]) > 1.0
     target = recording.model.targets[obs.target[wrong]]
     where = found.findings[0].effect.scope.as_dict()
     assert where == {"target": [target.name], "point": [target.point_names[obs.point[wrong]]]}
@@ -62,6 +64,7 @@ def test_report_of_a_finding(tmp_path):
     assert parameter["value"] == pytest.approx(true_value(truth, "growth"), rel=0.1)
     assert finding["heldout_rms_px"]["after"] < finding["heldout_rms_px"]["before"]
     html = page.read_text()
+    assert "measured minus predicted" in html
     # Self-contained: nothing is fetched.
     assert "http://" not in html and "https://" not in html and 'src="data:image/png' in html
     assert BY_ID["focal-drift"].explanation in html
