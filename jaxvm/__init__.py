@@ -25,6 +25,10 @@ import ctypes
 import os
 import sys
 
+from jaxvm import interrupted
+
+interrupted.heard_by_the_command()
+
 for _flag, _value in {
     "--xla_cpu_multi_thread_eigen": "false",
     "--xla_cpu_use_fusion_emitters": "false",

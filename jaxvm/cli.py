@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxvm import __version__, commands
-from jaxvm_command import INTERRUPTED, LAST_WORDS
+from jaxvm.interrupted import INTERRUPTED, LAST_WORDS
 
 BAD_INPUT = 2
 

@@ -7,6 +7,7 @@ import re
 import signal
 import subprocess
 import sys
+import sysconfig
 import time
 from dataclasses import replace
 
@@ -221,8 +222,9 @@ def test_what_a_library_makes_of_an_interrupt_is_one(board, capsys, monkeypatch)
 
 
 def test_an_interrupt_while_packages_are_imported():
+    command = os.path.join(sysconfig.get_path("scripts"), "jaxvm")
     run = subprocess.Popen(
-        [sys.executable, "-X", "importtime", "-m", "jaxvm_command", "validate", "nothing"],
+        [sys.executable, "-X", "importtime", command, "validate", "nothing"],
         stderr=subprocess.PIPE,
         text=True,
     )

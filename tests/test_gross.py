@@ -4,10 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from networks import board_recording
+from networks import board_recording, predicted
 
+from jaxvm.discover.diagnose import _searched
 from jaxvm.discover.gross import without_gross_errors
 from jaxvm.discover.heldout import hold_out, split
+from jaxvm.discover.search import Search
+from jaxvm.physics.effects import Effect, Scope, Term
 
 N_EPOCHS = 30
 
@@ -87,3 +90,27 @@ def test_sound_marks_all_stay(known):
     assert count == 0
     assert fitted is first and parts is all_parts
     assert abs(fitted.variance_factor - 1.0) < 4.0 * np.sqrt(2.0 / fitted.degrees_of_freedom)
+
+
+def test_what_an_effect_conceals_is_set_aside_when_it_is_found(known):
+    obs, rng = known.recording.observations, np.random.default_rng(7)
+    bent = Effect(
+        "bent", (Term("target.bow_x"),), "constant", "constant", (), 0.0,
+        Scope(target=("board",)), (6e-3,),
+    )  # fmt: skip
+    pixel = predicted(known.true_scene().with_effects((bent,), (8, 4)))
+    pixel += obs.sigma[:, None] * rng.standard_normal(pixel.shape)
+    wrong = np.sort(rng.choice(len(pixel), 8, replace=False))
+    pixel[wrong] += rng.choice([-4.0, 4.0], (8, 2))
+    recording = replace(known.recording, observations=replace(obs, pixel=pixel))
+    scene = known.true_scene(recording).with_effects((), (16, 8))
+    told: list[str] = []
+    found, plain, _, count = _searched(
+        scene, 3, lambda parts, fit, errors: Search(parts, fit, errors, 0), 8, told.append
+    )
+    assert np.array_equal(set_aside(plain, found.parts), wrong) and count == len(wrong)
+    assert sum("beginning again" in line for line in told) == 1
+    (finding,) = found.findings
+    assert finding.hypothesis.entries[0].id == "target-bow"
+    assert abs(finding.effect.amplitudes[0] - 6e-3) < 5.0 * finding.stds[0]
+    assert abs(found.current.variance_factor - 1.0) < 0.15

@@ -78,18 +78,14 @@ def diagnose(
     scene = start(build(recording, ()))
     scene = scene.with_effects(effects, _room(effects))
     progress("fit of the plain model")
-    parts, plain, n_rejected = _plain_fit(scene, every)
-    for _ in range(_BEGINNINGS):
-        plain, plain_heldout = parts.proven(plain)
-        found = Search(parts, plain, plain_heldout, len(effects), alpha, seed)
-        found.run(max_findings, progress)
-        # What was found may have concealed gross errors, which stop the search once they show.
-        _, cleaner, n = without_gross_errors(found.current, parts)
-        if not (found.findings and n):
-            break
-        progress(f"{n} gross errors show beside what was found: beginning again without them")
-        parts, n_rejected = cleaner, n
-        plain = parts.fit(scene)
+    found, plain, plain_heldout, n_rejected = _searched(
+        scene,
+        every,
+        lambda parts, fit, errors: Search(parts, fit, errors, len(effects), alpha, seed),
+        max_findings,
+        progress,
+    )
+    parts = found.parts
     current, findings = found.current, found.findings
 
     progress("final fit to all epochs")
@@ -168,6 +164,31 @@ def _with_advice(final: Adjustment, finding: Finding, place: int, parts: Split) 
         others=finding.others,
     )
     return replace(finding, advice=tuple(found))
+
+
+def _searched(
+    scene: Scene,
+    every: int,
+    search: Callable[[Split, Adjustment, HeldOut], Search],
+    most: int,
+    progress: Callable[[str], None],
+) -> tuple[Search, Adjustment, HeldOut, int]:
+    """A search that is through, the plain fit and its held-out errors, and the gross errors.
+
+    What is found may have concealed gross errors, which end a search once they show: signs that
+    flip leave them as large as they are. It begins again without them.
+    """
+    parts, plain, n_rejected = _plain_fit(scene, every)
+    begun = 0
+    while True:
+        plain, heldout = parts.proven(plain)
+        found, begun = search(parts, plain, heldout), begun + 1
+        found.run(most, progress)
+        _, cleaner, n = without_gross_errors(found.current, parts)
+        if not (found.findings and n) or begun == _BEGINNINGS:
+            return found, plain, heldout, n_rejected
+        progress(f"{n} gross errors show beside what was found: beginning again without them")
+        parts, n_rejected, plain = cleaner, n, cleaner.fit(scene)
 
 
 def _plain_fit(scene: Scene, every: int) -> tuple[Split, Adjustment, int]:

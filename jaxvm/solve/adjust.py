@@ -120,7 +120,7 @@ class Adjustment:
             pixels.append(f"left out           {lost} ranges to or from what nothing places then")
         return "\n".join(
             [
-                f"cost               {self.cost_before:.6g} -> {self.cost:.8g}",
+                f"cost               {self.cost_before:.8g} -> {self.cost:.8g}",
                 f"variance factor    {self.variance_factor:.4g}"
                 f"  ({self.degrees_of_freedom} degrees of freedom)",
                 *pixels,
