@@ -225,6 +225,9 @@ def _parser() -> argparse.ArgumentParser:
     simulate.add_argument(
         "--strength", type=float, default=None, help="deformation: factor on every effect"
     )
+    simulate.add_argument(
+        "--day", type=_whole(0), default=None, help="deformation: the same site, other weather"
+    )
 
     montecarlo = command(
         "montecarlo", "adjust a simulated network many times: errors against theory"

@@ -218,6 +218,7 @@ def run_simulate(options):
         options.seed,
         options.size or "full",
         1.0 if options.strength is None else options.strength,
+        options.day or 0,
     )
     with new_folder(options.out) as staging:
         made.write(staging)
@@ -230,7 +231,7 @@ def _simulate_network(options):
     from jaxvm.recording import describe
     from jaxvm.scenes import read_description, simulate_network, truth_folder
 
-    for name in ("hide", "size", "strength"):
+    for name in ("hide", "size", "strength", "day"):
         if getattr(options, name) is not None:
             raise ValueError(
                 f"--{name} is for deformation; what a network hides stands in its TOML, as "

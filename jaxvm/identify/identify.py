@@ -293,9 +293,9 @@ def _depth(plain: Adjustment, camera: str) -> float:
 
 
 def _focal(plain: Adjustment, camera: str) -> float:
-    """Mean focal length (px) of a camera."""
-    number = [c.name for c in plain.scene.model.cameras].index(camera)
-    return float(np.mean(plain.scene.state.focal[number]))
+    """Mean focal length (px) that the recording gives a camera; 0 where it gives none."""
+    given = next(c.focal_px for c in plain.scene.model.cameras if c.name == camera)
+    return 0.0 if given is None else float(np.mean(given))
 
 
 def _warnings(best: Fit, inputs: Inputs, courses: Trajectories) -> list[str]:

@@ -42,7 +42,7 @@ class CameraDrift:
         trained: what every input did.
         held_out_px: error (px RMS of a mark) of the blocks that were not fitted, noise taken off.
         drift_px: drift (px RMS of a mark) of the training, noise taken off.
-        focal_px: mean focal length of the camera it was identified on (px); 0 where unknown.
+        focal_px: mean focal length (px) that its recording gave the camera; 0 where none.
     """
 
     camera: str
