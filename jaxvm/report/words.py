@@ -209,7 +209,7 @@ def separate_by(finding: Finding) -> str:
     entries = finding.hypothesis.entries
     other = entries[0].separate_by if entries else "another driver's range, another geometry"
     if not finding.advice:
-        return f"{other} (by the catalogue; no further recording was weighed)"
+        return f"{other} (by the catalogue: these doubles are other names of it, or contain it)"
     best = finding.advice[0]
     rival = best.rivals[int(np.argmin(best.chances))].effect(()).name
     if best.chance < _HOPELESS:
