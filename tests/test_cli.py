@@ -373,8 +373,8 @@ def test_a_model_of_another_recording_is_named(board, tmp_path, capsys):
     own = (board / "recording.toml").read_text()
     other = tmp_path / "x.toml"
     for change, words in (
-        (("cameras.cam", "cameras.left"), "its cameras are left, the recording's cam; give"),
-        (("targets.board", "targets.b"), "its targets are b, the recording's board; give"),
+        (("cameras.cam", "cameras.left"), "its cameras are left, not cam; give"),
+        (("targets.board", "targets.b"), "its targets are b, not board; give"),
         (("rows = 5", "rows = 4"), 'target "board" has other points'),
         (("lens = ", "lense = "), 'unknown key "lense"'),
         (("format = 1", "format = "), "this is not valid TOML"),

@@ -9,7 +9,6 @@ from networks import board_recording, predicted
 from jaxvm.discover.diagnose import _searched
 from jaxvm.discover.gross import without_gross_errors
 from jaxvm.discover.heldout import hold_out, split
-from jaxvm.discover.search import Search
 from jaxvm.physics.effects import Effect, Scope, Term
 
 N_EPOCHS = 30
@@ -105,9 +104,7 @@ def test_what_an_effect_conceals_is_set_aside_when_it_is_found(known):
     recording = replace(known.recording, observations=replace(obs, pixel=pixel))
     scene = known.true_scene(recording).with_effects((), (16, 8))
     told: list[str] = []
-    found, plain, _, count = _searched(
-        scene, 3, lambda parts, fit, errors: Search(parts, fit, errors, 0), 8, told.append
-    )
+    found, plain, _, count = _searched(scene, 3, 0.01, 0, 8, told.append)
     assert np.array_equal(set_aside(plain, found.parts), wrong) and count == len(wrong)
     assert sum("beginning again" in line for line in told) == 1
     (finding,) = found.findings

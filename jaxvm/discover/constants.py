@@ -8,7 +8,7 @@ import numpy as np
 from jaxvm.discover.courses import at_epochs
 from jaxvm.network.scene import Scene
 from jaxvm.physics.effects import Effect
-from jaxvm.physics.forms import FORMS, JUMPS
+from jaxvm.physics.forms import FORMS
 
 
 def constants_held(scene: Scene, since: int = 0) -> np.ndarray:
@@ -45,11 +45,11 @@ def sensible(scene: Scene, effect: Effect) -> bool:
 
 def jumps_of(scene: Scene) -> list[tuple[int, int]]:
     """Every jump of the effects of a scene: number of the effect, and of its instant."""
-    jumping = ("step", *JUMPS.values())
     return [
         (number, k)
         for number, effect in enumerate(scene.effects)
-        for k in range(len(effect.constants) if effect.form in jumping else 0)
+        if FORMS[effect.form].single == "step"
+        for k in range(len(effect.constants))
     ]
 
 

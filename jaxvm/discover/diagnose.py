@@ -79,11 +79,7 @@ def diagnose(
     scene = scene.with_effects(effects, _room(effects))
     progress("fit of the plain model")
     found, plain, plain_heldout, n_rejected = _searched(
-        scene,
-        every,
-        lambda parts, fit, errors: Search(parts, fit, errors, len(effects), alpha, seed),
-        max_findings,
-        progress,
+        scene, every, alpha, seed, max_findings, progress
     )
     parts = found.parts
     current, findings = found.current, found.findings
@@ -169,7 +165,8 @@ def _with_advice(final: Adjustment, finding: Finding, place: int, parts: Split) 
 def _searched(
     scene: Scene,
     every: int,
-    search: Callable[[Split, Adjustment, HeldOut], Search],
+    alpha: float,
+    seed: int,
     most: int,
     progress: Callable[[str], None],
 ) -> tuple[Search, Adjustment, HeldOut, int]:
@@ -182,7 +179,7 @@ def _searched(
     begun = 0
     while True:
         plain, heldout = parts.proven(plain)
-        found, begun = search(parts, plain, heldout), begun + 1
+        found, begun = Search(parts, plain, heldout, len(scene.effects), alpha, seed), begun + 1
         found.run(most, progress)
         _, cleaner, n = without_gross_errors(found.current, parts)
         if not (found.findings and n) or begun == _BEGINNINGS:

@@ -18,7 +18,7 @@ from jaxvm.discover.score import ScoreTests
 from jaxvm.discover.select import DECIDED, decisive_gap, log_prior, price_of_columns, stacked
 from jaxvm.discover.space import member
 from jaxvm.physics.effects import Effect
-from jaxvm.physics.forms import JUMPS
+from jaxvm.physics.forms import FORMS
 from jaxvm.solve.adjust import Adjustment
 
 MOST, PLACES = 12, 3
@@ -227,8 +227,8 @@ def _at(families: tuple[Family, ...], effect: Effect) -> tuple[Family, ...]:
     found = []
     for family in families if effect.constants else ():
         # What jumps several times is asked wherever it may jump at all.
-        form = "step" if effect.form in JUMPS.values() else effect.form
-        own = family.by_driver_and_form().get((effect.driver, form), [])
+        kind = effect.driver, FORMS[effect.form].single
+        own = family.by_driver_and_form().get(kind, [])
         first = own[0] if own else 0
         if own and family.valid[:, first].any():
             course = Course(effect.driver, effect.form, effect.constants, effect.reference)

@@ -175,11 +175,18 @@ class Form:
     """Whether the driver is counted from its reference value (its mean over the recording)."""
     reads: tuple[int, ...] = ()
     """Of each basis the first constant that it reads; by default that of the form."""
+    more_of: str = ""
+    """Another form of which this has several at once: what may run in that may run in this."""
 
     def read_by(self, basis: int, constants: Sequence[T]) -> Sequence[T]:
         """Those constants of the form, one or two, that one of its bases reads."""
         first = self.reads[basis] if self.reads else 0
         return constants[first : first + 2]
+
+    @property
+    def single(self) -> str:
+        """The form itself, or that of which it has several."""
+        return self.more_of or self.name
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -329,6 +336,7 @@ FORMS: dict[str, Form] = {
                 _INSTANTS[:n],
                 f"suddenly, {n} times in {{driver}}",
                 reads=tuple(range(n)),
+                more_of="step",
             )
             for n, name in JUMPS.items()
         ),

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from jaxvm.recording.model import Model
+from jaxvm.recording.model import Model, other_bodies
 from jaxvm.recording.recording import Drivers, Links, Observations, Ranges, Recording
 
 PAUSE_S = 86_400.0
@@ -63,16 +63,11 @@ def join(first: Recording, second: Recording) -> Recording:
 
 def _common(first: Model, second: Model) -> Model:
     kinds = ("cameras", "stations", "targets", "rangefinders")
-    for kind in kinds:
-        own, other = ([body.name for body in getattr(m, kind)] for m in (first, second))
-        if own != other:
-            raise ValueError(
-                f"the recordings have other {kind} ({', '.join(own)}; {', '.join(other)}); "
-                "only recordings of the same bodies, in the same order, can be joined"
-            )
-    for a, b in zip(first.targets, second.targets, strict=True):
-        if a.point_names != b.point_names:
-            raise ValueError(f'target "{a.name}" has other marks in the second recording')
+    if other := other_bodies(first, second, kinds):
+        raise ValueError(
+            f"the second recording can't be joined: {other}; give one of the same bodies, in the "
+            "same order"
+        )
     return first
 
 

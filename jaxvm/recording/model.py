@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from jaxvm.geometry.lenses import LENS_NAMES, lens_family
 from jaxvm.geometry.targets import grid_points
 from jaxvm.physics.effects import Effect
+from jaxvm.recording.errors import listed
 
 FORMAT = 1
 
@@ -136,6 +137,21 @@ class Model:
     priors: tuple[Prior, ...] = ()
     closures: tuple[Closure, ...] = ()
     effects: tuple[Effect, ...] = ()
+
+
+def other_bodies(own: Model, other: Model, kinds: tuple[str, ...]) -> str:
+    """Which bodies of some kinds another model has, in words; "" where measurements fit both.
+
+    Measurements know bodies and marks by their order.
+    """
+    for kind in kinds:
+        ours, theirs = ([body.name for body in getattr(m, kind)] for m in (own, other))
+        if ours != theirs:
+            return f"its {kind} are {listed(theirs) or 'none'}, not {listed(ours) or 'none'}"
+    for a, b in zip(own.targets, other.targets, strict=True):
+        if a.point_names != b.point_names:
+            return f'its target "{a.name}" has other points'
+    return ""
 
 
 def of_epochs(model: Model, mask: Bool[np.ndarray, " epochs"]) -> Model:

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from jaxvm.recording.check import check_recording
-from jaxvm.recording.errors import RecordingError, has_not, in_file, listed
-from jaxvm.recording.model import Model
+from jaxvm.recording.errors import RecordingError, has_not, in_file
+from jaxvm.recording.model import Model, other_bodies
 from jaxvm.recording.parse import known_link, parse_model
 from jaxvm.recording.recording import (
     Drivers,
@@ -123,19 +123,8 @@ def check_same_bodies(own: Model, given: Model, file: str) -> None:
         RecordingError: names of cameras, targets or points differ, or their order, by which the
             measurements know them; `file` is where they stand.
     """
-    for kind in ("cameras", "targets"):
-        ours, theirs = ([body.name for body in getattr(m, kind)] for m in (own, given))
-        if ours != theirs:
-            raise RecordingError(
-                f"{file}: its {kind} are {listed(theirs)}, the recording's {listed(ours)}; "
-                "give a model of this recording"
-            )
-    for ours, theirs in zip(own.targets, given.targets, strict=True):
-        if ours.point_names != theirs.point_names:
-            raise RecordingError(
-                f'{file}: target "{ours.name}" has other points than in the recording; '
-                "give a model of this recording"
-            )
+    if other := other_bodies(own, given, ("cameras", "targets")):
+        raise RecordingError(f"{file}: {other}; give a model of this recording")
 
 
 def _required(folder: Path, name: str) -> Table:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from jaxvm.physics.effects import Term
-from jaxvm.physics.forms import JUMPS
+from jaxvm.physics.forms import FORMS
 
 Terms = tuple[Term, ...]
 
@@ -49,8 +49,8 @@ class Entry:
 
         What jumps may jump again.
         """
-        known = form in self.forms or ("step" in self.forms and form in JUMPS.values())
-        return known and any(kind in self.drivers for kind in kinds)
+        known = {form, FORMS[form].single} & {*self.forms}
+        return bool(known) and any(kind in self.drivers for kind in kinds)
 
 
 HYSTERESIS = ("hysteresis", "hysteresis with state")
