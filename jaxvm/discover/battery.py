@@ -111,6 +111,11 @@ class Battery:
     families: tuple[Family, ...]
     parts: tuple[tuple[Part, ...], ...]
 
+    @once
+    def n_columns(self) -> int:
+        """Number of columns of all hypotheses."""
+        return sum(int(np.sum(f.valid)) * f.n_terms * f.n_bases for f in self.families)
+
 
 def battery(scene: Scene, arrangement: Arrangement, families: tuple[Family, ...]) -> Battery:
     """Families with their courses and scopes over the cells of a scene."""

@@ -74,7 +74,13 @@ class Arrangement:
         self, values: Float[np.ndarray, "observations components"]
     ) -> Float[np.ndarray, "cells rows"]:
         """A vector over all observations in the shape of the residuals of the cells."""
-        return _by_component([values], self.rows, self.components)
+        return self.by_component([values])
+
+    def by_component(
+        self, parts: list[Float[np.ndarray, "observations components ..."]]
+    ) -> Float[np.ndarray, "cells rows ..."]:
+        """What the tables have for each observation, in the shape of the residuals of the cells."""
+        return _by_component(parts, self.rows, self.components)
 
     def of_cells(
         self, values: Float[np.ndarray, "n observations"]
@@ -113,7 +119,7 @@ def arrange(adjustment: Adjustment) -> Arrangement:
     scene, problem = adjustment.scene, adjustment.problem
     whitened = _whitened(problem, adjustment.x)
     n_groups = problem.sizes[1]
-    keys, views, drivers, halves, residuals, tangents, starts = [], [], [], [], [], [], []
+    keys, views, halves, residuals, tangents, starts = [], [], [], [], [], []
     components = max(r.shape[1] for _, r, _ in whitened)
     obs = scene.recording.observations
     tables = zip(problem.network.factors(), problem.packets, whitened, strict=False)
@@ -125,14 +131,11 @@ def arrange(adjustment: Adjustment) -> Arrangement:
         if isinstance(factor, PixelFactor):
             rows = scene.tables[number]
             entity = obs.camera[rows] * len(scene.model.targets) + obs.target[rows]
-            table = observation_driver_table(scene, factor, rows)
-            drivers.append(np.asarray(table)[:n])
         else:
             ranges = scene.recording.ranges
             assert ranges is not None
             first = len(scene.model.cameras) * len(scene.model.targets)
             entity = first + ranges.rangefinder * len(scene.model.targets) + ranges.target
-            drivers.append(np.asarray(range_driver_table(scene, factor))[:n])
         views.append(np.asarray(factor.view)[:n])
         epoch = views[-1] % len(scene.recording.time)
         # Cells of one camera lie together.
@@ -159,10 +162,23 @@ def arrange(adjustment: Adjustment) -> Arrangement:
         cells,
         rows,
         np.concatenate(views)[rows.min(axis=1)],
-        np.concatenate(drivers),
+        driver_table(adjustment),
         tuple(starts),
         components,
     )
+
+
+def driver_table(adjustment: Adjustment) -> Float[np.ndarray, "observations drivers"]:
+    """Observation-like drivers of all observations on which effects act, at the fit."""
+    scene, network = adjustment.scene, adjustment.problem.network
+    found = []
+    for factor, rows in zip(network.pixels, scene.tables, strict=True):
+        table = observation_driver_table(scene, factor, rows)
+        found.append(np.asarray(table)[: factor.n_real])
+    if network.ranges is not None:
+        table = range_driver_table(scene, network.ranges)
+        found.append(np.asarray(table)[: network.ranges.n_real])
+    return np.concatenate(found)
 
 
 def local_rows(

@@ -4,16 +4,19 @@ With G the tangents, J the Jacobian of the model and H = L L^T its normal matrix
 G^T G - Y^T Y with Y = (J L^-T)^T G: all are sums over cells, weighted by a course.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float32
 
 from jaxvm.discover.battery import MOST_PRODUCTS, Part
 from jaxvm.discover.cells import gathered
 
 _ABSORBED = 1e-8
 """Relative information below which a direction counts as absorbed by the model."""
+
+_SEEN = 1e-6
+"""Share of an effect that the model must leave, so that it can be scored."""
 
 _FEWEST_EPOCHS = 3.0
 """A hypothesis that fewer epochs carry than this can't be told from a few bad images."""
@@ -34,21 +37,21 @@ class Tangents:
         n_local: columns of `halves` that belong to local unknowns.
         square: among themselves; None where they are so many that
         stack: the tangents themselves take less room.
-        halves: with J L^-T; None where they are not wanted.
-        product: with the residuals.
+        halves: with J L^-T. All three are None where the information is known.
+        product: with the residuals, and with what else they are multiplied by.
     """
 
     n_local: int
     square: Float[np.ndarray, "cells terms terms"] | None
     stack: Float[np.ndarray, "cells terms rows"] | None
     halves: Float[np.ndarray, "cells terms halves"] | None
-    product: Float[np.ndarray, "cells terms"]
+    product: Float[np.ndarray, "cells terms vectors"]
 
     def shared(self, part: Part) -> Float[np.ndarray, "b columns shared"]:
         """What the shared unknowns see of each course."""
         assert self.halves is not None
         # With the local columns: what lies together is multiplied without a copy.
-        return _summed(part, at_cells(self.halves, part.place.cells))[:, :, self.n_local :]
+        return summed(part, at_cells(self.halves, part.place.cells))[:, :, self.n_local :]
 
     def gram(self, part: Part) -> Float[np.ndarray, "b columns columns"]:
         """Products of each course's columns, term by term."""
@@ -95,7 +98,7 @@ def at_cells(values: np.ndarray, cells: np.ndarray) -> np.ndarray:
     return values[first:last] if last - first == len(cells) else values[cells]
 
 
-def _summed(part: Part, values: Float[np.ndarray, "n terms ..."]) -> np.ndarray:
+def summed(part: Part, values: Float[np.ndarray, "n terms ..."]) -> np.ndarray:
     """Sums over the cells of a part, weighted by its courses: [b, columns, ...], term by term."""
     b, n_bases, n = part.weights.shape
     sums = part.weights.reshape(b * n_bases, n) @ values.reshape(n, -1)
@@ -106,7 +109,7 @@ def by_terms(values: Float[np.ndarray, "b_bases terms ..."], part: Part) -> np.n
     """One axis of columns, term by term."""
     b, n_bases, _ = part.weights.shape
     split = values.reshape(b, n_bases, *values.shape[1:])
-    return np.swapaxes(split, 1, 2).reshape(b, -1, *values.shape[2:])
+    return np.swapaxes(split, 1, 2).reshape(b, n_bases * values.shape[1], *values.shape[2:])
 
 
 def information_of(
@@ -144,9 +147,6 @@ def information_of(
     # Directions that the model absorbs to eight digits carry no information.
     size = np.diagonal(gram, axis1=1, axis2=2)
     unit = 1.0 / np.sqrt(np.where(size > 0.0, size, 1.0))
-    scaled = information * unit[:, :, None] * unit[:, None, :]
-    whitener = whitener_of(scaled)
-    seen = np.diagonal(scaled, axis1=1, axis2=2).max(axis=1)
     of_epoch = gathered(tangents.sizes(place.cells), place.epoch)  # E w
     carried = (part.by_epoch**2 @ of_epoch[:, :, None])[:, :, 0].T
     carried = carried.reshape(b, n_bases, -1).sum(axis=1)
@@ -154,8 +154,8 @@ def information_of(
     # By the size of the effect, not its square: a near image does not make others count less.
     n_carrying = np.sqrt(carried).sum(axis=1) ** 2 / np.maximum(total, 1e-300)
     fewest = min(_FEWEST_EPOCHS, 0.5 * len(place.epoch))
-    sound = valid & (seen > 1e-6) & (total > 0.0) & (n_carrying >= fewest)
-    return Information(whitener * unit[:, None, :], seen, sound)
+    sound = valid & (total > 0.0) & (n_carrying >= fewest)
+    return Information.of(information * unit[:, :, None] * unit[:, None, :], unit, sound)
 
 
 def whitener_of(information: Float[np.ndarray, "b k k"]) -> Float[np.ndarray, "b k k"]:
@@ -178,18 +178,39 @@ class Information:
     """What the courses of a part can show, whatever the residuals.
 
     Attributes:
+        scaled: information, for columns of unit length.
+        unit: by which columns are multiplied for that.
         whitener: W with W^T W the inverse information, so that the drop is |W S|^2.
         seen: share of the effect that the model does not absorb.
         sound: hypotheses that the model does not absorb and that enough epochs carry.
+        shared: what the shared unknowns see of each course; None where it is not kept.
     """
 
+    scaled: Float[np.ndarray, "b columns columns"]
+    unit: Float[np.ndarray, "b columns"]
     whitener: Float[np.ndarray, "b columns columns"]
     seen: Float[np.ndarray, " b"]
     sound: Bool[np.ndarray, " b"]
+    shared: Float32[np.ndarray, "b columns shared"] | None = None
+
+    @classmethod
+    def of(cls, scaled: np.ndarray, unit: np.ndarray, sound: np.ndarray) -> "Information":
+        """Of scaled information, and of the hypotheses that are sound but for what is absorbed."""
+        seen = np.diagonal(scaled, axis1=1, axis2=2).max(axis=1)
+        whitener = whitener_of(scaled) * unit[:, None, :]
+        return cls(scaled, unit, whitener, seen, sound & (seen > _SEEN))
+
+    def less(self, taken: Float[np.ndarray, "b columns p"]) -> "Information":
+        """What is left when further unknowns see so much of each course."""
+        own = self.unit[:, :, None] * taken
+        left = Information.of(self.scaled - own @ np.swapaxes(own, 1, 2), self.unit, self.sound)
+        if self.shared is None:
+            return left
+        return replace(left, shared=np.concatenate([self.shared, taken], axis=2, dtype=np.float32))
 
 
 def drop_of(known: Information, part: Part, product: np.ndarray):
     """Drop of chi-square [b] and one-step amplitudes [b, columns]."""
-    score = _summed(part, at_cells(product, part.place.cells))
+    score = summed(part, at_cells(product, part.place.cells))
     score = np.einsum("bdc,bc->bd", known.whitener, score)
     return np.sum(score**2, axis=1), -np.einsum("bdc,bd->bc", known.whitener, score)

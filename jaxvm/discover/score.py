@@ -12,6 +12,9 @@ epoch, camera, target and local group form a *cell*; inside a cell the course an
 constant, so all products are summed over cells once for each port and pattern, and thousands of
 courses of one scope cost one matrix product over its cells.
 
+A fit with further effects takes a little of the information that is known without them
+(`jaxvm.discover.bordered`).
+
 Significance: the residuals of every epoch are multiplied by random signs, again and again; the
 largest statistic over all hypotheses in each repetition gives a family-wise p-value that needs no
 independence inside an epoch (wild bootstrap of the scores).
@@ -20,12 +23,13 @@ independence inside an epoch (wild bootstrap of the scores).
 import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float, Float32
 
 from jaxvm.discover.battery import Battery, Part, battery
+from jaxvm.discover.bordered import bordered, moved
 from jaxvm.discover.cells import Arrangement, Cells, arrange
 from jaxvm.discover.groups import Group
 from jaxvm.discover.hypotheses import Family
@@ -39,16 +43,20 @@ from jaxvm.discover.products import (
     by_terms,
     drop_of,
     information_of,
+    summed,
 )
 from jaxvm.discover.ranking import Ranking, Scores, surprise
 from jaxvm.network.scene import Scene
-from jaxvm.physics.drivers import OBSERVATION_DRIVERS, driven_by, patterns
+from jaxvm.physics.drivers import driven_by, patterns
 from jaxvm.physics.effects import Term
 from jaxvm.physics.ports import PORT_INDEX
 from jaxvm.solve.adjust import Adjustment
 
 _STACKED = 32
 """Terms whose tangents are multiplied at a time, of as many groups as have them."""
+
+_MOST_KEPT = 30_000_000
+"""Numbers that are kept of what shared unknowns see of all hypotheses: 120 MB."""
 
 
 @dataclass(frozen=True)
@@ -58,14 +66,20 @@ class ScoreTests:
     The information is the same whatever residuals are scored: it is computed once, and kept.
 
     Attributes:
-        scene: the fitted scene.
+        fit: the adjusted scene.
         arrangement: its residuals and tangents.
         battery: the hypotheses.
+        plain: tests at the fit without its last effects, whose information is known.
+        first: tests at the fit that was there first; None for these.
+        new: observation-like drivers that are not those of the plain fit.
     """
 
-    scene: Scene
+    fit: Adjustment
     arrangement: Arrangement
     battery: Battery
+    plain: "ScoreTests | None" = None
+    first: "ScoreTests | None" = None
+    new: frozenset[str] = frozenset()
     _known: dict[tuple[int, int, int], Information] = field(default_factory=dict)
     _patterns: dict[tuple, np.ndarray] = field(default_factory=dict)
 
@@ -73,27 +87,45 @@ class ScoreTests:
     def of(cls, fit: Adjustment, families: tuple[Family, ...]) -> "ScoreTests":
         """Tests of the hypotheses of some families at a fit."""
         arrangement = arrange(fit)
-        return cls(fit.scene, arrangement, battery(fit.scene, arrangement, families))
+        return cls(fit, arrangement, battery(fit.scene, arrangement, families))
+
+    @property
+    def scene(self) -> Scene:
+        """The fitted scene."""
+        return self.fit.scene
 
     def about(self, families: tuple[Family, ...]) -> "ScoreTests":
         """Tests of other hypotheses at the same fit."""
         asked = battery(self.scene, self.arrangement, families)
-        return ScoreTests(self.scene, self.arrangement, asked)
+        return ScoreTests(self.fit, self.arrangement, asked)
 
     def at(self, fit: Adjustment) -> "ScoreTests":
-        """Tests of the same hypotheses at another fit of the same recording."""
-        found = ScoreTests(fit.scene, arrange(fit), self.battery)
+        """Tests of the same hypotheses at another fit of the same recording.
+
+        With further effects in the model what they take of the information is enough, where the
+        way from one fit to the other is straight.
+        """
+        if fit is self.fit:
+            return self
+        latest = self.plain or self
+        first = latest.first or latest
+        for known in (latest,) if latest is first else (latest, first):
+            beside = bordered(known.arrangement, known.fit, fit)
+            if beside is not None:
+                arrangement, new = beside
+                return ScoreTests(
+                    fit, arrangement, self.battery, known, first, new, _patterns=known._but(new)
+                )
+        found = ScoreTests(fit, arrange(fit), self.battery, first=first)
         if np.array_equal(found.arrangement.rows, self.arrangement.rows):
-            old, new = self.arrangement.drivers, found.arrangement.drivers
-            moved = {
-                name
-                for k, name in enumerate(OBSERVATION_DRIVERS)
-                if not np.array_equal(old[:, k], new[:, k], equal_nan=True)
-            }
             # Where the image and the marks are does not change with the fit: nor do most patterns.
-            same = {key: p for key, p in self._patterns.items() if not moved & driven_by(key[0])}
-            found._patterns.update(same)
+            new = moved(self.arrangement.drivers, found.arrangement.drivers, least=0.0)
+            found._patterns.update(self._but(new))
         return found
+
+    def _but(self, new: frozenset[str]) -> dict[tuple, np.ndarray]:
+        """Patterns but those that depend on some drivers."""
+        return {key: p for key, p in self._patterns.items() if not new & driven_by(key[0])}
 
     def score(
         self,
@@ -145,9 +177,10 @@ class ScoreTests:
             for p, part in enumerate(self.battery.parts[number]):
                 if valid[part.courses, part.scope].any():
                     wanted.append((number, g, p))
-        # Where the information is known and no signs are flipped, products with residuals do.
-        full = tested.flips or any(key not in self._known for key in wanted)
-        tangents = self._tangents(groups, tested.residual, full)
+        # Where the information is known, products with residuals and with what is new do.
+        full = any(self._wants_halves(key, tested) for key in wanted)
+        vectors = np.concatenate([tested.residual[:, :, None], self._border], axis=2)
+        tangents = self._tangents(groups, vectors, full)
         for key in wanted:
             self._score_part(key, tangents[key[:2]], tested, scores[key[0]])
         for number in {number for number, _ in groups}:
@@ -158,54 +191,85 @@ class ScoreTests:
         self, key: tuple[int, int, int], tangents: Tangents, tested: "_Tested", scores: Scores
     ) -> None:
         number, g, p = key
-        part, product = self.battery.parts[number][p], tangents.product
+        part, product = self.battery.parts[number][p], tangents.product[:, :, 0]
         here = g, part.courses, part.scope
-        shared = tangents.shared(part) if tested.flips or key not in self._known else None
-        if shared is not None and key not in self._known:
-            valid = self.battery.families[number].valid[here]
-            self._known[key] = information_of(tangents, part, shared, valid)
-        known = self._known[key]
+        known = self._known.get(key)
+        if known is None:
+            known = self._known[key] = self._information(key, part, tangents)
         scores.seen[here], scores.valid[here] = known.seen, known.sound
         scores.drop[here], scores.amplitude[here] = drop_of(known, part, product)
-        if shared is not None and tested.flips and known.sound.any():
+        if tested.flips and known.sound.any():
+            shared = tangents.shared(part) if known.shared is None else known.shared
             flipped = _flipped(known, part, product, shared, tested)
             scores.null[g] = np.maximum(scores.null[g], flipped)
 
+    def _information(
+        self, key: tuple[int, int, int], part: Part, tangents: Tangents
+    ) -> Information:
+        """Of the courses of a part: by what the border takes of what is known, or all anew."""
+        if (known := self._without_border(key)) is not None:
+            new = at_cells(tangents.product[:, :, 1:], part.place.cells)
+            return known.less(summed(part, new))
+        shared = tangents.shared(part)
+        valid = self.battery.families[key[0]].valid[key[1], part.courses, part.scope]
+        known = information_of(tangents, part, shared, valid)
+        keeps = self.battery.n_columns * shared.shape[2] <= _MOST_KEPT
+        return replace(known, shared=shared.astype(np.float32)) if keeps else known
+
+    def _wants_halves(self, key: tuple[int, int, int], tested: "_Tested") -> bool:
+        """Whether a part asks for products with the model's own Jacobian."""
+        known = self._known.get(key) or self._without_border(key)
+        return known is None or (tested.flips and known.shared is None)
+
+    def _without_border(self, key: tuple[int, int, int]) -> Information | None:
+        """What is known of a part at the plain fit, where its patterns are the same."""
+        terms = self.battery.families[key[0]].groups[key[1]].terms
+        if self.plain is None or any(self.new & driven_by(term.driver) for term in terms):
+            return None
+        return self.plain._known.get(key)
+
+    @property
+    def _border(self) -> Float[np.ndarray, "cells rows p"]:
+        """What the model has beside the plain one, along the columns of J L^-T."""
+        half = self.arrangement.cells.half
+        known = half.shape[2] if self.plain is None else self.plain.arrangement.cells.half.shape[2]
+        return half[:, :, known:]
+
     def _tangents(
-        self, groups: list[tuple[int, int]], residual: np.ndarray, full: bool
+        self, groups: list[tuple[int, int]], vectors: np.ndarray, full: bool
     ) -> dict[tuple[int, int], Tangents]:
         """Products of the tangents of some groups."""
-        families, height = self.battery.families, residual.shape[1]
+        families, height = self.battery.families, vectors.shape[1]
         found, alike = {}, []
         for key in groups:
             group = families[key[0]].groups[key[1]]
             if group.mark is not None:
-                found[key] = self._of_mark(group, group.mark, residual, full)
+                found[key] = self._of_mark(group, group.mark, vectors, full)
             # Of very many terms the products would take more room than the tangents.
             elif len(group.terms) > height:
-                found[key] = self._of_many_terms(group, residual, full)
+                found[key] = self._of_many_terms(group, vectors, full)
             else:
                 alike.append(key)
         some = [families[number].groups[g] for number, g in alike]
         if some:
-            products = self._of_groups(some, residual, full)
+            products = self._of_groups(some, vectors, full)
             found.update(zip(alike, products, strict=True))
         return found
 
     def _of_groups(
-        self, groups: list[Group], residual: np.ndarray, full: bool
+        self, groups: list[Group], vectors: np.ndarray, full: bool
     ) -> Iterator[Tangents]:
         """Products of the tangents of groups that act on all marks, some cells at a time.
 
         What is multiplied stays in the cache, and what all groups share is read once.
         """
-        cells, (n, height) = self.arrangement.cells, residual.shape
+        cells, (n, height, n_vectors) = self.arrangement.cells, vectors.shape
         ends = np.cumsum([len(group.terms) for group in groups])
         each = [slice(end - len(g.terms), end) for g, end in zip(groups, ends, strict=True)]
         own = [factors for group in groups for factors in self._factors(group)]
-        product = np.empty((n, len(own)))
+        product = np.empty((n, len(own), n_vectors))
         halves = [np.empty((n, len(g.terms), cells.half.shape[2])) for g in groups if full]
-        square = [np.empty((n, *2 * (len(g.terms),))) for g in groups]
+        square = [np.empty((n, *2 * (len(g.terms),))) for g in groups if full]
         stack = np.empty((min(CELLS, n), len(own), *own[0][0].shape[1:]))
         for first in range(0, n, CELLS):
             here = slice(first, min(first + CELLS, n))
@@ -213,29 +277,29 @@ class ScoreTests:
             for k, (tangent, pattern) in enumerate(own):
                 np.multiply(tangent[here], pattern[here], out=apart[:, k])
             piece = apart.reshape(*apart.shape[:2], height)
-            product[here] = (piece @ residual[here, :, None])[:, :, 0]
-            half = piece @ cells.half[here] if full else None
-            of_term = np.einsum("nkr,nkr->nk", piece, piece)
+            product[here] = piece @ vectors[here]
+            if not full:
+                continue
+            half, of_term = piece @ cells.half[here], np.einsum("nkr,nkr->nk", piece, piece)
             for g, terms in enumerate(each):
-                if half is not None:
-                    halves[g][here] = half[:, terms]
+                halves[g][here] = half[:, terms]
                 if len(groups[g].terms) == 1:
                     square[g][here] = of_term[:, terms, None]
                 else:
                     alone = piece[:, terms]
                     np.matmul(alone, np.swapaxes(alone, 1, 2), out=square[g][here])
         for g, terms in enumerate(each):
-            half = halves[g] if full else None
-            yield Tangents(cells.n_local, square[g], None, half, product[:, terms])
+            own_square, own_half = (square[g], halves[g]) if full else (None, None)
+            yield Tangents(cells.n_local, own_square, None, own_half, product[:, terms])
 
-    def _of_many_terms(self, group: Group, residual: np.ndarray, full: bool) -> Tangents:
+    def _of_many_terms(self, group: Group, vectors: np.ndarray, full: bool) -> Tangents:
         """Products of the tangents of a group of very many terms; most act in few cells each."""
-        cells, (n, height) = self.arrangement.cells, residual.shape
+        cells, (n, height, n_vectors) = self.arrangement.cells, vectors.shape
         own = self._factors(group)
         acts = np.stack([pattern.any(axis=(1, 2)) for _, pattern in own])
-        product = np.zeros((n, len(own)))
+        product = np.zeros((n, len(own), n_vectors))
         halves = np.zeros((n, len(own), cells.half.shape[2])) if full else None
-        stack = np.zeros((n, len(own), height))
+        stack = np.zeros((n, len(own), height)) if full else None
         for first in range(0, n, MANY_TERMS_CELLS):
             here = slice(first, min(first + MANY_TERMS_CELLS, n))
             acting = np.flatnonzero(acts[:, here].any(axis=1))
@@ -243,10 +307,9 @@ class ScoreTests:
             if not tangents:
                 continue
             piece = np.stack(tangents, axis=1).reshape(here.stop - first, -1, height)
-            stack[here, acting] = piece
-            product[here, acting] = (piece @ residual[here, :, None])[:, :, 0]
-            if halves is not None:
-                halves[here, acting] = piece @ cells.half[here]
+            product[here, acting] = piece @ vectors[here]
+            if halves is not None and stack is not None:
+                stack[here, acting], halves[here, acting] = piece, piece @ cells.half[here]
         return Tangents(cells.n_local, None, stack, halves, product)
 
     def _factors(self, group: Group) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -263,10 +326,10 @@ class ScoreTests:
         ]
 
     def _of_mark(
-        self, group: Group, mark: tuple[int, int], residual: np.ndarray, full: bool
+        self, group: Group, mark: tuple[int, int], vectors: np.ndarray, full: bool
     ) -> Tangents:
         """Products of the tangents of a group that acts on one mark: it is once in a cell."""
-        cells, (n, height) = self.arrangement.cells, residual.shape
+        cells, (n, height, _) = self.arrangement.cells, vectors.shape
         here, place = self._marks[mark]
         width = height // self.arrangement.components
         rows = here[:, None], place[:, None] + width * np.arange(self.arrangement.components)
@@ -283,10 +346,10 @@ class ScoreTests:
 
         return Tangents(
             cells.n_local,
-            in_cells(tangent @ np.swapaxes(tangent, 1, 2)),
+            in_cells(tangent @ np.swapaxes(tangent, 1, 2)) if full else None,
             None,
             in_cells(tangent @ cells.half[rows]) if full else None,
-            in_cells((tangent @ residual[rows][:, :, None])[:, :, 0]),
+            in_cells(tangent @ vectors[rows]),
         )
 
     def _pattern(self, term: Term) -> Float[np.ndarray, "cells width"]:
