@@ -98,7 +98,7 @@ def test_maps_are_scored_as_by_dense_matrices(stereo, monkeypatch):
     monkeypatch.setattr(products, "MOST_PRODUCTS", 0)
     # Some cells at a time in which no term acts, too.
     monkeypatch.setattr(products, "MANY_TERMS_CELLS", 1)
-    monkeypatch.setattr("jaxvm.discover.score.MANY_TERMS_CELLS", 1)
+    monkeypatch.setattr("jaxvm.discover.tangents.MANY_TERMS_CELLS", 1)
     again = ScoreTests.of(stereo, tuple(families)).score(1.0).scores
     cells, wide = tests.arrangement.cells, set()
     rows = cells.residual.size
@@ -112,7 +112,7 @@ def test_maps_are_scored_as_by_dense_matrices(stereo, monkeypatch):
             g = np.stack(
                 [
                     cells.tangent[PORT_INDEX[term.port]]
-                    * np.tile(tests._pattern(term), tests.arrangement.components)
+                    * np.tile(tests.tangents.pattern(term), tests.arrangement.components)
                     * course[:, None]
                     for term in family.groups[0].terms
                 ]

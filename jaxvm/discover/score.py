@@ -31,12 +31,8 @@ from jaxtyping import Float, Float32
 from jaxvm.discover.battery import Battery, Part, battery
 from jaxvm.discover.bordered import bordered, moved
 from jaxvm.discover.cells import Arrangement, Cells, arrange
-from jaxvm.discover.groups import Group
 from jaxvm.discover.hypotheses import Family
-from jaxvm.discover.once import once
 from jaxvm.discover.products import (
-    CELLS,
-    MANY_TERMS_CELLS,
     Information,
     Tangents,
     at_cells,
@@ -46,10 +42,9 @@ from jaxvm.discover.products import (
     summed,
 )
 from jaxvm.discover.ranking import Ranking, Scores, surprise
+from jaxvm.discover.tangents import TangentsAt
 from jaxvm.network.scene import Scene
-from jaxvm.physics.drivers import driven_by, patterns
-from jaxvm.physics.effects import Term
-from jaxvm.physics.ports import PORT_INDEX
+from jaxvm.physics.drivers import driven_by
 from jaxvm.solve.adjust import Adjustment
 
 _STACKED = 32
@@ -67,7 +62,7 @@ class ScoreTests:
 
     Attributes:
         fit: the adjusted scene.
-        arrangement: its residuals and tangents.
+        tangents: of its residuals, by all ports.
         battery: the hypotheses.
         plain: tests at the fit without its last effects, whose information is known.
         first: tests at the fit that was there first; None for these.
@@ -75,29 +70,34 @@ class ScoreTests:
     """
 
     fit: Adjustment
-    arrangement: Arrangement
+    tangents: TangentsAt
     battery: Battery
     plain: "ScoreTests | None" = None
     first: "ScoreTests | None" = None
     new: frozenset[str] = frozenset()
     _known: dict[tuple[int, int, int], Information] = field(default_factory=dict)
-    _patterns: dict[tuple, np.ndarray] = field(default_factory=dict)
 
     @classmethod
     def of(cls, fit: Adjustment, families: tuple[Family, ...]) -> "ScoreTests":
         """Tests of the hypotheses of some families at a fit."""
         arrangement = arrange(fit)
-        return cls(fit, arrangement, battery(fit.scene, arrangement, families))
+        asked = battery(fit.scene, arrangement, families)
+        return cls(fit, TangentsAt(fit.scene, arrangement), asked)
 
     @property
     def scene(self) -> Scene:
         """The fitted scene."""
         return self.fit.scene
 
+    @property
+    def arrangement(self) -> Arrangement:
+        """Its residuals, and the derivatives of its ports."""
+        return self.tangents.arrangement
+
     def about(self, families: tuple[Family, ...]) -> "ScoreTests":
         """Tests of other hypotheses at the same fit."""
         asked = battery(self.scene, self.arrangement, families)
-        return ScoreTests(self.fit, self.arrangement, asked)
+        return ScoreTests(self.fit, self.tangents, asked)
 
     def at(self, fit: Adjustment) -> "ScoreTests":
         """Tests of the same hypotheses at another fit of the same recording.
@@ -113,19 +113,15 @@ class ScoreTests:
             beside = bordered(known.arrangement, known.fit, fit)
             if beside is not None:
                 arrangement, new = beside
-                return ScoreTests(
-                    fit, arrangement, self.battery, known, first, new, _patterns=known._but(new)
-                )
-        found = ScoreTests(fit, arrange(fit), self.battery, first=first)
-        if np.array_equal(found.arrangement.rows, self.arrangement.rows):
+                tangents = known.tangents.at(fit.scene, arrangement, new)
+                return ScoreTests(fit, tangents, self.battery, known, first, new)
+        arrangement = arrange(fit)
+        tangents = TangentsAt(fit.scene, arrangement)
+        if np.array_equal(arrangement.rows, self.arrangement.rows):
             # Where the image and the marks are does not change with the fit: nor do most patterns.
-            new = moved(self.arrangement.drivers, found.arrangement.drivers, least=0.0)
-            found._patterns.update(self._but(new))
-        return found
-
-    def _but(self, new: frozenset[str]) -> dict[tuple, np.ndarray]:
-        """Patterns but those that depend on some drivers."""
-        return {key: p for key, p in self._patterns.items() if not new & driven_by(key[0])}
+            new = moved(self.arrangement.drivers, arrangement.drivers, least=0.0)
+            tangents = self.tangents.at(fit.scene, arrangement, new)
+        return ScoreTests(fit, tangents, self.battery, first=first)
 
     def score(
         self,
@@ -147,7 +143,8 @@ class ScoreTests:
         scores = tuple(_unscored(f, tested) for f in self.battery.families)
         # NumPy lets other threads run while it multiplies.
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            self._evaluate_patterns(pool)
+            groups = (g for family in self.battery.families for g in family.groups)
+            self.tangents.evaluate(groups, pool)
             for _ in pool.map(lambda own: self._score_groups(own, tested, scores), self._batches()):
                 pass
         for own in scores:
@@ -180,9 +177,10 @@ class ScoreTests:
         # Where the information is known, products with residuals and with what is new do.
         full = any(self._wants_halves(key, tested) for key in wanted)
         vectors = np.concatenate([tested.residual[:, :, None], self._border], axis=2)
-        tangents = self._tangents(groups, vectors, full)
+        asked = [self.battery.families[number].groups[g] for number, g in groups]
+        found = dict(zip(groups, self.tangents.products(asked, vectors, full), strict=True))
         for key in wanted:
-            self._score_part(key, tangents[key[:2]], tested, scores[key[0]])
+            self._score_part(key, found[key[:2]], tested, scores[key[0]])
         for number in {number for number, _ in groups}:
             for part in self.battery.parts[number]:
                 part.forget()
@@ -235,164 +233,6 @@ class ScoreTests:
         known = half.shape[2] if self.plain is None else self.plain.arrangement.cells.half.shape[2]
         return half[:, :, known:]
 
-    def _tangents(
-        self, groups: list[tuple[int, int]], vectors: np.ndarray, full: bool
-    ) -> dict[tuple[int, int], Tangents]:
-        """Products of the tangents of some groups."""
-        families, height = self.battery.families, vectors.shape[1]
-        found, alike = {}, []
-        for key in groups:
-            group = families[key[0]].groups[key[1]]
-            if group.mark is not None:
-                found[key] = self._of_mark(group, group.mark, vectors, full)
-            # Of very many terms the products would take more room than the tangents.
-            elif len(group.terms) > height:
-                found[key] = self._of_many_terms(group, vectors, full)
-            else:
-                alike.append(key)
-        some = [families[number].groups[g] for number, g in alike]
-        if some:
-            products = self._of_groups(some, vectors, full)
-            found.update(zip(alike, products, strict=True))
-        return found
-
-    def _of_groups(
-        self, groups: list[Group], vectors: np.ndarray, full: bool
-    ) -> Iterator[Tangents]:
-        """Products of the tangents of groups that act on all marks, some cells at a time.
-
-        What is multiplied stays in the cache, and what all groups share is read once.
-        """
-        cells, (n, height, n_vectors) = self.arrangement.cells, vectors.shape
-        ends = np.cumsum([len(group.terms) for group in groups])
-        each = [slice(end - len(g.terms), end) for g, end in zip(groups, ends, strict=True)]
-        own = [factors for group in groups for factors in self._factors(group)]
-        product = np.empty((n, len(own), n_vectors))
-        halves = [np.empty((n, len(g.terms), cells.half.shape[2])) for g in groups if full]
-        square = [np.empty((n, *2 * (len(g.terms),))) for g in groups if full]
-        stack = np.empty((min(CELLS, n), len(own), *own[0][0].shape[1:]))
-        for first in range(0, n, CELLS):
-            here = slice(first, min(first + CELLS, n))
-            apart = stack[: here.stop - first]
-            for k, (tangent, pattern) in enumerate(own):
-                np.multiply(tangent[here], pattern[here], out=apart[:, k])
-            piece = apart.reshape(*apart.shape[:2], height)
-            product[here] = piece @ vectors[here]
-            if not full:
-                continue
-            half, of_term = piece @ cells.half[here], np.einsum("nkr,nkr->nk", piece, piece)
-            for g, terms in enumerate(each):
-                halves[g][here] = half[:, terms]
-                if len(groups[g].terms) == 1:
-                    square[g][here] = of_term[:, terms, None]
-                else:
-                    alone = piece[:, terms]
-                    np.matmul(alone, np.swapaxes(alone, 1, 2), out=square[g][here])
-        for g, terms in enumerate(each):
-            own_square, own_half = (square[g], halves[g]) if full else (None, None)
-            yield Tangents(cells.n_local, own_square, None, own_half, product[:, terms])
-
-    def _of_many_terms(self, group: Group, vectors: np.ndarray, full: bool) -> Tangents:
-        """Products of the tangents of a group of very many terms; most act in few cells each."""
-        cells, (n, height, n_vectors) = self.arrangement.cells, vectors.shape
-        own = self._factors(group)
-        acts = np.stack([pattern.any(axis=(1, 2)) for _, pattern in own])
-        product = np.zeros((n, len(own), n_vectors))
-        halves = np.zeros((n, len(own), cells.half.shape[2])) if full else None
-        stack = np.zeros((n, len(own), height)) if full else None
-        for first in range(0, n, MANY_TERMS_CELLS):
-            here = slice(first, min(first + MANY_TERMS_CELLS, n))
-            acting = np.flatnonzero(acts[:, here].any(axis=1))
-            tangents = [own[k][0][here] * own[k][1][here] for k in acting]
-            if not tangents:
-                continue
-            piece = np.stack(tangents, axis=1).reshape(here.stop - first, -1, height)
-            product[here, acting] = piece @ vectors[here]
-            if halves is not None and stack is not None:
-                stack[here, acting], halves[here, acting] = piece, piece @ cells.half[here]
-        return Tangents(cells.n_local, None, stack, halves, product)
-
-    def _factors(self, group: Group) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Of each term of a group the port's derivative [cells, components, width], and what it is
-        multiplied by [cells, 1, width]."""
-        cells, components = self.arrangement.cells, self.arrangement.components
-        shape = len(cells.residual), components, -1
-        return [
-            (
-                cells.tangent[PORT_INDEX[term.port]].reshape(shape),
-                self._pattern(term)[:, None],
-            )
-            for term in group.terms
-        ]
-
-    def _of_mark(
-        self, group: Group, mark: tuple[int, int], vectors: np.ndarray, full: bool
-    ) -> Tangents:
-        """Products of the tangents of a group that acts on one mark: it is once in a cell."""
-        cells, (n, height, _) = self.arrangement.cells, vectors.shape
-        here, place = self._marks[mark]
-        width = height // self.arrangement.components
-        rows = here[:, None], place[:, None] + width * np.arange(self.arrangement.components)
-        own = [
-            cells.tangent[PORT_INDEX[term.port]][rows] * self._pattern(term)[here, place][:, None]
-            for term in group.terms
-        ]
-        tangent = np.stack(own, axis=1)
-
-        def in_cells(values: np.ndarray) -> np.ndarray:
-            found = np.zeros((n, *values.shape[1:]))
-            found[here] = values
-            return found
-
-        return Tangents(
-            cells.n_local,
-            in_cells(tangent @ np.swapaxes(tangent, 1, 2)) if full else None,
-            None,
-            in_cells(tangent @ cells.half[rows]) if full else None,
-            in_cells(tangent @ vectors[rows]),
-        )
-
-    def _pattern(self, term: Term) -> Float[np.ndarray, "cells width"]:
-        """Pattern of a term over the observations of all cells."""
-        own = self._patterns[_key(term)]
-        return own if term.weight == 1.0 else term.weight * own
-
-    def _evaluate_patterns(self, pool: ThreadPoolExecutor) -> None:
-        """Those that are not known yet, all of a driver and a basis at a time."""
-        alike: dict[tuple, dict[tuple, Term]] = {}
-        for family in self.battery.families:
-            for group in family.groups:
-                for term in group.terms:
-                    if _key(term) not in self._patterns:
-                        alike.setdefault((term.driver, term.basis), {})[_key(term)] = term
-
-        def evaluated(terms: dict[tuple, Term]) -> np.ndarray:
-            values = np.asarray(patterns(tuple(terms.values()), self.arrangement.drivers))
-            return self.arrangement.of_cells(values.T)
-
-        for terms, values in zip(alike.values(), pool.map(evaluated, alike.values()), strict=True):
-            self._patterns.update(zip(terms, values, strict=True))
-
-    @once
-    def _marks(self) -> dict[tuple[int, int], tuple[np.ndarray, np.ndarray]]:
-        """Of each mark the cells that hold it, and its place in each."""
-        obs, arrangement = self.scene.recording.observations, self.arrangement
-        number = self.scene.first_point[obs.target] + obs.point
-        own = np.zeros(len(arrangement.drivers))
-        for start, rows in zip(arrangement.starts, self.scene.tables, strict=False):
-            own[start : start + len(rows)] = 1 + number[rows]
-        numbers = arrangement.of_cells(own)
-        here, place = np.nonzero(numbers)
-        label = numbers[here, place].astype(int) - 1
-        first = self.scene.first_point
-        ends = np.cumsum(np.bincount(label, minlength=first[-1]))
-        lists = np.split(np.argsort(label, kind="stable"), ends[:-1])
-        return {
-            (target, point): (here[lists[start + point]], place[lists[start + point]])
-            for target, start in enumerate(first[:-1])
-            for point in range(first[target + 1] - start)
-        }
-
 
 @dataclass(frozen=True)
 class _Tested:
@@ -441,11 +281,6 @@ def _unscored(family: Family, tested: _Tested) -> Scores:
         valid=np.zeros(shape, bool),
         variance=tested.variance,
     )
-
-
-def _key(term: Term) -> tuple:
-    """What the pattern of a term depends on."""
-    return term.driver, term.basis, term.constants
 
 
 def _flipped(
