@@ -176,13 +176,18 @@ def run_adjust(options):
 def run_identify(options):
     from jaxvm.identify import identify
     from jaxvm.recording.files import write_files
+    from jaxvm.report.words import lasting_drift
 
     progress = _progress(options)
     recording = _open(options.recording, options.model, progress)
     found = identify(recording, one_step=not options.two_steps, progress=progress)
     write_files(options.out.absolute().parent, {options.out.name: found.model.text()})
     answer = {"model": str(options.out), "cameras": [own.as_dict() for own in found.cameras]}
-    return answer, f"{found.summary()}\n\nwritten    {options.out}"
+    lines = [found.summary()]
+    for own in found.cameras:
+        if lasting := lasting_drift(own.drift):
+            lines += [f"camera {own.drift.camera}, in the end", *(f"  {line}" for line in lasting)]
+    return answer, "\n".join([*lines, f"\nwritten    {options.out}"])
 
 
 def run_compensate(options):

@@ -69,6 +69,11 @@ class Difference:
         each = self.gain.reshape(len(self.gain), len(self.inputs), -1).sum(axis=2)
         return each / (1.0 + self.a.sum())
 
+    def stationary_sigma(self) -> Float[np.ndarray, "outputs inputs"]:
+        """Its standard deviations, as if the gains of one input were independent and `a` known."""
+        each = (self.gain_sigma**2).reshape(len(self.gain), len(self.inputs), -1).sum(axis=2)
+        return np.sqrt(each) / abs(1.0 + self.a.sum())
+
 
 class _Samples:
     """Inputs in steps; the samples before the first epoch are those of the log."""

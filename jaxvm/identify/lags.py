@@ -96,9 +96,16 @@ class Lags:
 
     def stationary(self) -> Float[np.ndarray, "outputs inputs"]:
         """Change of every output for a lasting unit change of every input."""
+        return self._over_lags(self.gain)
+
+    def stationary_sigma(self) -> Float[np.ndarray, "outputs inputs"]:
+        """Its standard deviations, as if those of the lags of one input were independent."""
+        return np.sqrt(self._over_lags(self.gain_sigma**2))
+
+    def _over_lags(self, gain: np.ndarray) -> Float[np.ndarray, "outputs inputs"]:
         m, k = len(self.inputs), self.structure.power
-        lagged = self.gain[:, m * k :].reshape(len(self.gain), self.structure.order, m).sum(axis=1)
-        return lagged + (self.gain[:, :m] if k else 0.0)
+        lagged = gain[:, m * k :].reshape(len(gain), self.structure.order, m).sum(axis=1)
+        return lagged + (gain[:, :m] if k else 0.0)
 
 
 def regressors(

@@ -11,6 +11,8 @@ from jaxvm.discover.diagnosis import Diagnosis, Finding
 from jaxvm.discover.heldout import Gain
 from jaxvm.discover.scatter import ALIKE
 from jaxvm.discover.shape import shape_words
+from jaxvm.identify.inputs import are_power
+from jaxvm.identify.model import CameraDrift
 from jaxvm.physics.catalogue import BY_ID
 from jaxvm.physics.drivers import channel_unit
 from jaxvm.physics.effects import Effect
@@ -123,6 +125,32 @@ def quantity(value: float, std: float, unit: str) -> str:
 def _significant(value: float, digits: int) -> str:
     text = f"{value:.{digits}g}"
     return f"{float(text):g}" if re.search(r"e[+-]?\d", text) and 1e-4 < abs(value) < 1e6 else text
+
+
+_CLEAR = 3.0
+"""Standard deviations from which a lasting change of a camera is told."""
+
+
+def lasting_drift(drift: CameraDrift) -> list[str]:
+    """What a lasting change of its inputs does to a camera in the end, a line for each port.
+
+    What is less than three standard deviations is left out; the largest in the training come first.
+    """
+    names, dynamics = drift.dynamics.inputs, drift.dynamics
+    power = are_power(names)
+    spans = [1.0 if on else drift.trained[n].high - drift.trained[n].low
+             for n, on in zip(names, power, strict=True)]  # fmt: skip
+    lines = []
+    changes = zip(drift.ports, dynamics.stationary(), dynamics.stationary_sigma(), strict=True)
+    for port, each, sigma in changes:
+        told, unit = [], _PORT[port].unit
+        for k in np.argsort(-np.abs(each) * spans):
+            if abs(each[k]) > _CLEAR * sigma[k]:
+                per = unit if power[k] else _per(unit, driver_unit(names[k]), 1, hourly=False)
+                size = quantity(float(each[k]), float(sigma[k]), per)
+                told.append(f"{size} {'after' if power[k] else 'of'} {names[k]}")
+        lines += [f"{port} {', '.join(told)}"] if told else []
+    return lines
 
 
 def when(effect: Effect, stds: tuple[float, ...] = ()) -> str:
