@@ -106,6 +106,25 @@ def test_what_sways_is_not_called_jumps(monkeypatch):
     assert any(h.course.form == "4 jumps" and own > 100.0 for h, own, _ in offered)
 
 
+def test_a_curve_at_another_place_speaks_against_jumps(loose):
+    """What one camera does at random is followed by four jumps of its station, too."""
+    _, parts, _, tests, ranking, leading = loose
+    offered = with_jumps(leading, tests, ranking, parts.n)
+    scopes = {h.scope for h, *_ in offered if "jumps" in h.course.form}
+    assert scopes
+    raised = []
+    for own in ranking.scores:
+        drop = own.drop.copy()
+        for (driver, form), places in own.family.by_driver_and_form().items():
+            if (driver, form) == ("time", "curve"):
+                for s, scope in enumerate(own.family.scopes):
+                    if scope not in scopes:
+                        drop[:, places, s] = 1e9
+        raised.append(replace(own, drop=drop))
+    other = replace(ranking, scores=tuple(raised))
+    assert with_jumps(leading, tests, other, parts.n) == leading
+
+
 def test_nothing_is_tried_where_no_step_explains_enough(loose, monkeypatch):
     _, parts, _, tests, ranking, leading = loose
     monkeypatch.setattr("jaxvm.discover.jumps._LEAST", 1.01)

@@ -102,6 +102,10 @@ def test_amounts_follow_what_acts_at_their_ports_and_place():
     assert follows(hunts, step)
     assert not any(follows(hunts, other) for other in (elsewhere, shift))
     assert not follows(step, hunts)
+    # The principal point follows a camera that turns, not one that comes nearer.
+    jumps = replace(hunts, terms=each("epoch", "sensor.cx", "sensor.cy", numbers=range(N_EPOCHS)))
+    turn, nearer = (replace(step, terms=(Term(p),)) for p in ("mount.turn_x", "mount.shift_z"))
+    assert follows(jumps, turn) and not follows(jumps, nearer) and not follows(hunts, turn)
     findings = [told(step), told(hunts), told(shift)]
     assert [followed(findings, k) for k in range(3)] == [True, False, False]
 

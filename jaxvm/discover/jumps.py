@@ -3,7 +3,9 @@
 One step explains a part of it, and something that runs smoothly may then explain more. So where a
 named step explains a good part of what the leading hypothesis does, it is given a second instant, a
 third and a fourth, each where it explains most beside the others. Four jumps follow much that does
-not jump: what they claim is that all stands still between them, and a curve must not do better.
+not jump: what they claim is that all stands still between them, and a curve must not do better, at
+that place or another: what is random from image to image at one camera follows four jumps of its
+station, too.
 """
 
 from collections.abc import Iterator
@@ -59,7 +61,7 @@ def with_jumps(leading: Leading, tests: ScoreTests, ranking: Ranking, n: int) ->
     instants = [place.hypothesis.course.constants for place in places]
     channels = tests.scene.network.channels
     every = [gaps(place.hypothesis.course.driver, channels).tolist() for place in places]
-    smooth = [_by_a_curve(ranking, place) for place in places]
+    smooth = [_by_a_curve(ranking, place.hypothesis.course.driver) for place in places]
     best: dict[int, tuple[Hypothesis, float, np.ndarray]] = {}
     for count in range(2, 1 + min(max(JUMPS), *map(len, every))):
         instants, found = _with_one_more(tests, variance, places, instants, every)
@@ -71,17 +73,17 @@ def with_jumps(leading: Leading, tests: ScoreTests, ranking: Ranking, n: int) ->
     return sorted([*leading, *best.values()], key=lambda item: -item[1])
 
 
-def _by_a_curve(ranking: Ranking, place: _Place) -> float:
-    """What the best free-form curve of the same driver in the same scope explains.
+def _by_a_curve(ranking: Ranking, driver: str) -> float:
+    """What the best free-form curve of a driver explains, wherever it acts.
 
     On the scale of chi-square, less the one that noise gives it on average for each knot.
     """
-    most, (_, _, s) = -np.inf, place.index
+    most = -np.inf
     for scores in ranking.scores:
         drop = np.where(scores.valid, scores.drop, -np.inf) / scores.variance
-        for (driver, form), own in scores.family.by_driver_and_form().items():
-            if form in N_KNOTS and driver == place.hypothesis.course.driver:
-                most = max(most, float(drop[:, own, s].max()) - scores.amplitude.shape[-1])
+        for (other, form), own in scores.family.by_driver_and_form().items():
+            if form in N_KNOTS and other == driver:
+                most = max(most, float(drop[:, own].max()) - scores.amplitude.shape[-1])
     return most
 
 

@@ -30,6 +30,9 @@ _MOST_TRIED = 12
 """Alternatives that are fitted at most, those of the first findings first: what was named while
 most was missing is the likeliest to be wrong."""
 
+_MOVING = {"sensor.cx", "sensor.cy", "mount.turn_x", "mount.turn_y"}
+"""Ports that move an image as a whole: amounts at some follow what happens at the others."""
+
 _LIKELIER = 2.0
 """Odds from which a double leads in place of what fits best; less is within what odds are worth."""
 
@@ -62,15 +65,15 @@ def prune(
 
 
 def _wider(k: int, current: Adjustment, without: Adjustment, n: int) -> float:
-    """What amounts of every image cost more without the effect at place k, which they can follow.
+    """What amounts of every image cost more without the effect at place k, which they may follow.
 
-    The price of an amount goes with the logarithm of what all of them explain, that is of their
-    square; it is at most ln n.
+    Those that can't do not grow. The price of an amount goes with the logarithm of what all of them
+    explain, that is of their square; it is at most ln n.
     """
     effects, cost = current.scene.fitted_effects(), 0.0
     others = (*effects[:k], *effects[k + 1 :])
     for one, other in zip(others, without.scene.fitted_effects(), strict=True):
-        if follows(one, effects[k]):
+        if _has_amounts(one):
             old, new = (float(np.sum(np.square(e.amplitudes))) for e in (one, other))
             used = int(np.count_nonzero(other.amplitudes))
             cost += used * float(np.clip(np.log(new / max(old, 1e-300)), 0.0, np.log(n)))
@@ -81,7 +84,14 @@ def follows(one: Effect, effect: Effect) -> bool:
     """Whether one has an amount in every image with which it can take the course of an effect."""
     ports = {term.port for term in one.terms if term.driver == "epoch"}
     own = {term.port for term in effect.terms}
-    return len(one.amplitudes) > FREE and own <= ports and one.scope == effect.scope
+    reach = ports | _MOVING if ports & _MOVING else ports
+    return _has_amounts(one) and own <= reach and one.scope == effect.scope
+
+
+def _has_amounts(effect: Effect) -> bool:
+    """Whether an effect has an amount for every image."""
+    epochs = any(term.driver == "epoch" for term in effect.terms)
+    return epochs and len(effect.amplitudes) > FREE
 
 
 def followed(findings: list[Finding], k: int) -> bool:
