@@ -34,7 +34,6 @@ _CURVED, _UNSEEN = 1e-4, 1.0
 _SMALL = 1e-6
 """Part of their amplitudes at which effects are derived: none of it, but constants show."""
 
-
 _MOVED = 0.02
 """Change of a driver, over its spread, from which its patterns are others."""
 
