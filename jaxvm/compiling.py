@@ -176,7 +176,7 @@ def _compiled(lowered, file: Path):
             compilation_cache.reset_cache()
     try:
         _write(file, serialize_executable.serialize(executable))
-    except (ValueError, NotImplementedError):  # e.g. with constants as arguments
+    except (ValueError, NotImplementedError):  # JAX can't write what has constants as arguments
         return None
     return executable
 

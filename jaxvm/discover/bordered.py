@@ -19,8 +19,6 @@ from jaxtyping import Float, Int
 
 from jaxvm.discover.cells import Arrangement, driver_table
 from jaxvm.discover.select import stacked
-from jaxvm.network.factors import PixelFactor, RangeFactor
-from jaxvm.network.network import Network
 from jaxvm.network.scene import Scene
 from jaxvm.physics.drivers import OBSERVATION_DRIVERS
 from jaxvm.physics.effects import Effect
@@ -96,13 +94,8 @@ def _goes_on(plain: Adjustment, fit: Adjustment) -> bool:
     given = plain.scene.effects
     if list(map(kind, given)) != list(map(kind, fit.scene.effects[: len(given)])):
         return False
-    weights = [[factor.weight for factor in _acted_on(of.problem.network)] for of in (plain, fit)]
+    weights = [[factor.weight for factor in of.problem.network.acted_on] for of in (plain, fit)]
     return all(np.array_equal(a, b) for a, b in zip(*weights, strict=True))
-
-
-def _acted_on(network: Network) -> list[PixelFactor | RangeFactor]:
-    """Tables on which effects act, the first of all."""
-    return [*network.pixels, *([] if network.ranges is None else [network.ranges])]
 
 
 def _products(
@@ -141,14 +134,14 @@ def _columns(
     number = np.full(problem.n + 1, -1)
     number[wanted] = np.arange(len(wanted))
     prior = np.zeros((len(wanted), len(wanted)))
-    own, acted_on = [], len(_acted_on(problem.network))
+    own, acted_on = [], len(problem.network.acted_on)
     for k, (table, packets) in enumerate(zip(tables, problem.packets, strict=True)):
         found = _of_table(np.asarray(table.jacobian), packets, number, len(wanted))
         if k < acted_on:
             own.append(found)
         else:
             prior += np.tensordot(found, found, axes=([0, 1], [0, 1]))
-    real = [f.n_real for f in _acted_on(problem.network)]
+    real = [f.n_real for f in problem.network.acted_on]
     columns = arrangement.by_component([part[:n] for part, n in zip(own, real, strict=True)])
     acts = columns.any(axis=(0, 1))
     return columns[:, :, acts], prior[np.ix_(acts, acts)]
@@ -186,12 +179,7 @@ def _at_plain(plain: Scene, fit: Adjustment) -> tuple[Problem, Int[np.ndarray, "
         plain.state,
         (jnp.asarray(amplitude), jnp.asarray(constant)),
     )
-    there = scene.with_state(state).network
-
-    def patterns(network: Network):
-        return [factor.pattern for factor in _acted_on(network)]
-
-    network = eqx.tree_at(patterns, problem.network, patterns(there))
+    network = problem.network.with_patterns_of(scene.with_state(state).network)
     own = np.concatenate(
         [layout.all("amplitude")[n_columns:], layout.all("constant")[n_constants:-1]]
     )

@@ -101,7 +101,7 @@ def _whitened(problem: Problem, x):
     """Half rows, residuals and port tangents of all tables on which effects act."""
     tables = problem.linearised(x, tangent=True)
     hessian = problem.assembled(tables).hessian
-    n_effect = len(problem.network.pixels) + (problem.network.ranges is not None)
+    n_effect = len(problem.network.acted_on)
     acting = tables[:n_effect]
     jacobians = [table.jacobian for table in acting]
     halves = _half_rows(hessian, problem.packets[:n_effect], jacobians, problem.sizes)

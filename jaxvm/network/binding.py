@@ -79,8 +79,7 @@ def _with_amplitude_priors(scene: Scene, network: Network) -> Network:
     if n_columns == 0:
         return replace(network, priors=given)
     reach = np.zeros(n_columns)
-    tables = [*network.pixels, *([] if network.ranges is None else [network.ranges])]
-    for factor in tables:
+    for factor in network.acted_on:
         reach = np.maximum(reach, np.abs(np.asarray(factor.pattern)).max(axis=0, initial=0.0))
     own = np.asarray(courses(network.effects, scene.state.constant, network.channels))
     reach = reach * np.abs(own).max(axis=1)

@@ -45,6 +45,19 @@ class Network(eqx.Module):
         others = (self.ranges, self.links, self.edges, self.closures, self.priors)
         return (*self.pixels, *(factor for factor in others if factor is not None))
 
+    @property
+    def acted_on(self) -> tuple[PixelFactor | RangeFactor, ...]:
+        """Tables on which effects act: the first ones of `factors`."""
+        return (*self.pixels, *(() if self.ranges is None else (self.ranges,)))
+
+    def with_patterns_of(self, other: "Network") -> "Network":
+        """The same network with the patterns of its effects as they are in another one."""
+
+        def patterns(network: Network):
+            return [factor.pattern for factor in network.acted_on]
+
+        return eqx.tree_at(patterns, self, patterns(other))
+
     def residuals(self, blocks: Sequence) -> "Residuals":
         """Blocks of all tables, in the order of `factors`, by their names."""
         n = len(self.pixels)

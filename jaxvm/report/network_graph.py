@@ -259,7 +259,7 @@ def _links(adjustment: Adjustment, blocks):
     if links is None or network.links is None:
         return np.zeros((0, 6, 6)), np.zeros(0, bool)
     aside = np.asarray(network.links.weight)[: len(links.name)] <= 0.0
-    of_links = blocks[len(network.pixels) + (network.ranges is not None)]
+    of_links = blocks[len(network.acted_on)]
     return of_links, aside
 
 

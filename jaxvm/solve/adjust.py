@@ -215,13 +215,8 @@ def _moved(found: Adjustment) -> float:
     """Sum of squared changes of whitened residuals by the patterns at the solution."""
     if not found.scene.effects:
         return 0.0
-
-    def patterns(network):
-        ranges = () if network.ranges is None else (network.ranges.pattern,)
-        return [*(factor.pattern for factor in network.pixels), *ranges]
-
     network, state = found.problem.network, _state(found.problem, found.x)
-    anew = eqx.tree_at(patterns, network, patterns(found.scene.network))
+    anew = network.with_patterns_of(found.scene.network)
     old, new = jax.tree.leaves(residual(state, network)), jax.tree.leaves(residual(state, anew))
     return sum(
         float(np.sum((np.asarray(b) - np.asarray(a)) ** 2)) for a, b in zip(old, new, strict=True)
