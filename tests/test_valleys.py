@@ -43,7 +43,7 @@ def test_the_bend_is_the_second_derivative_along_the_step(loss):
         assert min(float(w.min()) for w in weights) < 0.9
     _, pull = jax.vjp(stacked, x)
     (expected,) = pull([w * own for w, own in zip(weights, second, strict=True)])
-    got = problem.bend(x, step)
+    got = problem.bend(problem.linearised(x), x, step)
     size = float(jnp.abs(expected).max())
     assert size > 1e-3
     np.testing.assert_allclose(got, expected, rtol=0, atol=2e-3 * size)
@@ -85,7 +85,7 @@ def test_a_correction_that_is_too_long_is_not_taken(tilted):
     info = optimise._as_info(problem.normal(jnp.zeros(problem.n)))
     y, state = optimise._begin(solver, info)
     y, state = optimise._advance(solver, y, state, info)
-    bend = problem.bend(y, state.trial - y)
+    bend = problem.bend(problem.linearised(y), y, state.trial - y)
     straight = state.trial
     gentle = optimise._bent(solver, y, state, 1e-6 * bend).trial
     wild = optimise._bent(solver, y, state, 1e9 * bend).trial

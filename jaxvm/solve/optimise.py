@@ -202,14 +202,21 @@ def minimise(
     info = _as_info(normal)
     y, state = _begin(solver, info)
     y, state = _advance(solver, y, state, info)
-    doubts = 0
+    curved = problem if isinstance(problem, Problem) else None
+    curved = curved if isinstance(solver.search, Relaxing) else None
+    doubts, here = 0, None
     while not (bool(state.done) or (np.isfinite(wanted) and _out_of_reach(state, wanted))):
-        before = state
-        y, state = _advance(solver, y, state, _as_info(problem.normal(state.trial)))
-        if isinstance(problem, Problem) and isinstance(solver.search, Relaxing):
-            doubts += not _trusts_more(before, state)
-            if doubts >= _CURVED and not bool(state.done):
-                state = _bent(solver, y, state, problem.bend(y, state.trial - y))
+        if curved is None:
+            y, state = _advance(solver, y, state, _as_info(problem.normal(state.trial)))
+            continue
+        before, tables = state, curved.linearised(state.trial)
+        y, state = _advance(solver, y, state, _as_info(curved.assembled(tables)))
+        if int(state.accepted) > int(before.accepted):
+            here = tables
+        doubts += not _trusts_more(before, state)
+        if doubts >= _CURVED and not bool(state.done):
+            here = curved.linearised(y) if here is None else here
+            state = _bent(solver, y, state, curved.bend(here, y, state.trial - y))
     return y, state
 
 

@@ -174,13 +174,15 @@ class Problem(eqx.Module):
         """Cost, gradient and Gauss-Newton matrix, with the weights of the robust loss."""
         return self.assembled(self.linearised(x))
 
-    def bend(self, x: Float[Array, " n"], step: Float[Array, " n"]) -> Float[Array, " n"]:
-        """J^T r'' at x, with r'' the second derivative of the residuals along a step.
+    def bend(
+        self, tables: list[Linearised], x: Float[Array, " n"], step: Float[Array, " n"]
+    ) -> Float[Array, " n"]:
+        """J^T r'' of the tables at x, with r'' the second derivative of the residuals along a step.
 
         By central differences: a tenth of the step leaves a hundredth of its fourth derivative. The
         weights of the robust loss are those at x.
         """
-        tables, part = self.linearised(x), _SHORT * step
+        part = _SHORT * step
         ahead, behind = self.residual(x + part), self.residual(x - part)
         return bent(tables, ahead, behind, self.packets, self.loss, self.n)
 
