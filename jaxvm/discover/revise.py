@@ -17,7 +17,7 @@ from jaxvm.discover.select import price, price_of_columns
 from jaxvm.network.scene import Scene
 from jaxvm.physics.effects import Effect, room_for
 from jaxvm.solve.adjust import Adjustment
-from jaxvm.solve.covariance import wald_drops
+from jaxvm.solve.covariance import amplitude_covariance, wald_drops
 
 
 class Fit(Protocol):
@@ -51,15 +51,13 @@ def prune(
     course saves them counts for it.
     """
     given = given_effects(current, findings)
-    effects, lost = current.scene.fitted_effects(), lost_without(current, findings)
-    for k, finding in enumerate(findings[:-1]):
-        drop = lost[k] / current.variance_factor
-        price = _price_of(finding, drop, n)
-        if drop >= price:
+    effects = current.scene.fitted_effects()
+    for k, (drop, cost) in enumerate(_worth(current, findings, n)[:-1]):
+        if drop >= cost:
             continue
         kept = (*effects[: given + k], *effects[given + k + 1 :])
         without = fit(current.scene.with_effects(kept, current.scene.room))
-        if drop + _wider(given + k, current, without, n) < price:
+        if drop + _wider(given + k, current, without, n) < cost:
             return without, findings[:k] + findings[k + 1 :]
     return current, findings
 
@@ -209,22 +207,28 @@ def complexity(findings: list[Finding], variance: float, n: int) -> float:
 
 def _superfluous(current: Adjustment, findings: list[Finding], n: int) -> list[int]:
     """Findings that the others make superfluous (Wald test against BIC)."""
-    found = []
-    lost = lost_without(current, findings)
-    for k, (finding, rise) in enumerate(zip(findings, lost, strict=True)):
-        drop = rise / current.variance_factor
-        if drop < _price_of(finding, drop, n):
-            found.append(k)
+    worth = _worth(current, findings, n)
+    return [k for k, (drop, cost) in enumerate(worth) if drop < cost]
+
+
+def _worth(current: Adjustment, findings: list[Finding], n: int) -> list[tuple[float, float]]:
+    """Of each finding the drop of chi-square that is left, and what it costs."""
+    variance, found = current.variance_factor, []
+    spread = amplitude_covariance(current)
+    for finding, own in zip(findings, _places(current, findings), strict=True):
+        effect, drop = finding.effect, wald_drops(current, [own], spread)[0] / variance
+        known = variance * spread[np.ix_(own, own)]
+        columns = price_of_columns(finding.hypothesis, effect.amplitudes, drop, n, known)
+        found.append((drop, columns + len(effect.constants) * float(np.log(n))))
     return found
-
-
-def _price_of(finding: Finding, drop: float, n: int) -> float:
-    """What the amplitudes and constants of a finding cost, of which a drop is left."""
-    price = price_of_columns(finding.hypothesis, finding.effect.amplitudes, drop, n)
-    return price + len(finding.effect.constants) * float(np.log(n))
 
 
 def lost_without(current: Adjustment, findings: list[Finding]) -> list[float]:
     """Rise of twice the cost without each finding, all others refitted (Wald)."""
+    return wald_drops(current, _places(current, findings))
+
+
+def _places(current: Adjustment, findings: list[Finding]) -> list[np.ndarray]:
+    """Numbers of the amplitudes of each finding."""
     places = current.scene.places()[given_effects(current, findings) :]
-    return wald_drops(current, [np.arange(own.start, own.stop) for own, _ in places])
+    return [np.arange(own.start, own.stop) for own, _ in places]

@@ -12,6 +12,7 @@ import numpy as np
 from jaxvm.discover.constants import constants_held, sensible
 from jaxvm.discover.heldout import Split
 from jaxvm.discover.hypotheses import FREE, Hypothesis
+from jaxvm.discover.one_course import lost_by_one_course
 from jaxvm.discover.ranking import Ranking, top
 from jaxvm.network.scene import Scene
 from jaxvm.physics.catalogue import Entry
@@ -19,6 +20,7 @@ from jaxvm.physics.effects import Effect, room_for
 from jaxvm.physics.forms import FORMS, N_KNOTS
 from jaxvm.physics.ports import PORT_INDEX, PORTS
 from jaxvm.solve.adjust import Adjustment, adjust
+from jaxvm.solve.covariance import amplitude_covariance
 
 DECIDED = 2.0 * np.log(20.0)
 """Gap in chi-square at which one hypothesis is twenty times as likely as another."""
@@ -119,19 +121,27 @@ def best_named(hypothesis: Hypothesis, amplitudes: np.ndarray) -> Hypothesis:
 
 
 def evidence(
-    hypothesis: Hypothesis, drop: float, amplitudes: np.ndarray, variance: float, n: int
+    hypothesis: Hypothesis,
+    drop: float,
+    amplitudes: np.ndarray,
+    variance: float,
+    n: int,
+    spread: np.ndarray | None = None,
 ) -> float:
     """Evidence of a hypothesis from its drop of chi-square.
 
     Each constant that is refined costs what the drop lets it be known by (Laplace): next to nothing
-    where any value does, as much as a column where one value alone does.
+    where any value does, as much as a column where one value alone does. `spread` is the covariance
+    of the amplitudes, where they were fitted, for unit variance.
     """
     drop = drop / variance
     own = FORMS[hypothesis.course.form].constants[: len(hypothesis.course.constants)]
     refined = min(np.log1p(_SHARP * max(drop, 0.0)), np.log(n))
     constants = sum(refined if constant.refined else np.log(n) for constant in own)
     prior = log_prior(hypothesis, np.asarray(amplitudes))
-    return drop - price_of_columns(hypothesis, amplitudes, drop, n) - constants + 2.0 * prior
+    known = None if spread is None else variance * spread
+    columns = price_of_columns(hypothesis, amplitudes, drop, n, known)
+    return drop - columns - constants + 2.0 * prior
 
 
 def price(
@@ -141,17 +151,27 @@ def price(
     return drop / variance - evidence(hypothesis, drop, amplitudes, variance, n)
 
 
-def price_of_columns(hypothesis: Hypothesis, amplitudes, drop: float, n: int) -> float:
+def price_of_columns(
+    hypothesis: Hypothesis, amplitudes, drop: float, n: int, spread: np.ndarray | None = None
+) -> float:
     """What the amplitudes of a hypothesis cost: ln n each.
 
     Of a map with many tiles each knows little: their prior has the width that the tiles themselves
     show (empirical Bayes), and costs 1 + ln(drop / columns) for each of them, which is less than
     the ln n of a single unknown. Amounts of epochs that are set aside stay zero and cost nothing.
+    Where all terms may follow one course, the amplitudes cost no more than that model does, and
+    what it loses; the covariance of the amplitudes (`spread`) tells it.
     """
+    form = FORMS[hypothesis.course.form]
     columns = int(np.count_nonzero(amplitudes)) or len(amplitudes)
-    if len(amplitudes) > FREE and hypothesis.course.form not in N_KNOTS:
+    if len(amplitudes) > FREE and form.name not in N_KNOTS:
         return float(columns * min(np.log(n), 1.0 + np.log(max(drop / columns, 1.0))))
-    return float(columns * np.log(n))
+    price = float(columns * np.log(n))
+    terms, bases = len(hypothesis.group.terms), len(form.bases)
+    if spread is None or not form.one_course or len(amplitudes) != terms * bases:
+        return price
+    fewer = (terms + bases - 1) * float(np.log(n))
+    return min(price, fewer + lost_by_one_course(np.asarray(amplitudes), spread, bases))
 
 
 def identity(hypothesis: Hypothesis) -> tuple:
@@ -238,7 +258,12 @@ def refit(base: Adjustment, hypothesis: Hypothesis, amplitudes, split: Split) ->
         return None
     variance = fitted.variance_factor
     drop = 2.0 * (base.cost - fitted.cost)
-    own = evidence(hypothesis, drop, np.asarray(effect.amplitudes), variance, split.n)
+    # What the terms of an effect may do apart from each other is told by their covariance.
+    spread = None
+    if FORMS[effect.form].one_course and 1 < len(hypothesis.group.terms):
+        place, _ = fitted.scene.places()[-1]
+        spread = amplitude_covariance(fitted, np.arange(place.start, place.stop))
+    own = evidence(hypothesis, drop, np.asarray(effect.amplitudes), variance, split.n, spread)
     # Of several names for the same the size decides which comes first.
     named = best_named(hypothesis, np.asarray(effect.amplitudes))
     known = (*effects[:-1], replace(named.effect(0.0 * amplitudes), spread=effect.spread))

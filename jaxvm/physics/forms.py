@@ -177,6 +177,9 @@ class Form:
     """Of each basis the first constant that it reads; by default that of the form."""
     more_of: str = ""
     """Another form of which this has several at once: what may run in that may run in this."""
+    one_course: bool = False
+    """Whether its bases make up one course (a lag and its first state), by which whatever moves
+    does so along one line; a vibration goes round, and every jump has a way of its own."""
 
     def read_by(self, basis: int, constants: Sequence[T]) -> Sequence[T]:
         """Those constants of the form, one or two, that one of its bases reads."""
@@ -215,6 +218,7 @@ FORMS: dict[str, Form] = {
             ("one", "linear"),
             (),
             "in proportion to {driver}, from a reference of its own",
+            one_course=True,
         ),
         Form(
             "affine lag",
@@ -222,6 +226,7 @@ FORMS: dict[str, Form] = {
             (_TAU,),
             "following {driver} with a lag, from a reference of its own",
             centred=True,
+            one_course=True,
         ),
         Form(
             "parabola",
@@ -229,8 +234,16 @@ FORMS: dict[str, Form] = {
             (),
             "as a parabola of {driver}, from a reference of its own",
             centred=True,
+            one_course=True,
         ),
-        Form("quadratic", ("linear", "square"), (), "as a parabola of {driver}", centred=True),
+        Form(
+            "quadratic",
+            ("linear", "square"),
+            (),
+            "as a parabola of {driver}",
+            centred=True,
+            one_course=True,
+        ),
         Form("lag", ("lag",), (_TAU,), "following {driver} with a lag", centred=True),
         Form(
             "lag with state",
@@ -238,6 +251,7 @@ FORMS: dict[str, Form] = {
             (_TAU,),
             "following {driver} with a lag, from a state of its own at first",
             centred=True,
+            one_course=True,
         ),
         Form(
             "delay",
@@ -254,6 +268,7 @@ FORMS: dict[str, Form] = {
             "following {driver} with two time constants",
             centred=True,
             reads=(0, 1),
+            one_course=True,
         ),
         Form("proportional", ("linear",), (), "in proportion to {driver} itself"),
         Form("square", ("square",), (), "in proportion to the square of {driver} itself"),
@@ -263,6 +278,7 @@ FORMS: dict[str, Form] = {
             (),
             "in proportion to {driver}, more or less so as time goes on",
             centred=True,
+            one_course=True,
         ),
         Form("rate", ("rate",), (), "in proportion to the rate of {driver}"),
         Form(
@@ -276,6 +292,7 @@ FORMS: dict[str, Form] = {
             ("transient", "first state"),
             (_TAU,),
             "as far as {driver} is ahead of its own lag, from a state of its own at first",
+            one_course=True,
         ),
         Form(
             "direction",
@@ -289,6 +306,7 @@ FORMS: dict[str, Form] = {
             (Constant("half play", "driver"),),
             "with {driver} and with backlash",
             centred=True,
+            one_course=True,
         ),
         Form(
             "hysteresis with state",
@@ -296,6 +314,7 @@ FORMS: dict[str, Form] = {
             (Constant("half play", "driver"), Constant("first contact", "1", refined=False)),
             "with {driver} and with backlash, from a contact of its own at first",
             centred=True,
+            one_course=True,
         ),
         Form("onset", ("onset",), (_TAU,), "settling exponentially with {driver}"),
         Form("fading", ("decay",), (_TAU,), "fading exponentially with {driver}"),
@@ -305,6 +324,7 @@ FORMS: dict[str, Form] = {
             (_TAU, Constant("slow time constant", "s")),
             "fading with two time constants of {driver}",
             reads=(0, 1),
+            one_course=True,
         ),
         Form(
             "doubling",

@@ -75,12 +75,15 @@ def _derivative(problem: Problem, x, quantity):
     return jax.jacrev(lambda y: jnp.ravel(quantity(problem.state(y))))(x)
 
 
-def wald_drops(adjustment: Adjustment, groups: list[np.ndarray]) -> list[float]:
+def wald_drops(
+    adjustment: Adjustment, groups: list[np.ndarray], spread: np.ndarray | None = None
+) -> list[float]:
     """How much chi-square would rise if groups of amplitudes were held at zero: a^T C^-1 a.
 
-    Each group lists amplitudes by their number.
+    Each group lists amplitudes by their number; `spread` is the covariance of all amplitudes, where
+    it is known already.
     """
-    spread = amplitude_covariance(adjustment)
+    spread = amplitude_covariance(adjustment) if spread is None else spread
     values = np.asarray(adjustment.scene.state.amplitude)
     return [
         float(values[own] @ np.linalg.solve(spread[np.ix_(own, own)], values[own]))
