@@ -93,11 +93,11 @@ def better_pair(
         drops = [2.0 * (plain.cost - pair[0].adjustment.cost)]
         drops.append(2.0 * (pair[0].adjustment.cost - pair[1].adjustment.cost))
         costs = [
-            price(c.hypothesis, drop, c.amplitudes, variance, parts.n)
+            price(c.hypothesis, drop, c.amplitudes, variance, parts.n, c.spread)
             for c, drop in zip(pair, drops, strict=True)
         ]
         gained = 2.0 * (current.cost - pair[1].adjustment.cost) / variance
-        gained += complexity(findings, variance, parts.n) - sum(costs)
+        gained += complexity(current, findings, variance, parts.n) - sum(costs)
         if gained > least:
             best, least = pair, gained
     return best

@@ -7,7 +7,7 @@ G^T G - Y^T Y with Y = (J L^-T)^T G: all are sums over cells, weighted by a cour
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float
 
 from jaxvm.discover.battery import MOST_PRODUCTS, Part
 from jaxvm.discover.cells import gathered
@@ -191,7 +191,7 @@ class Information:
     whitener: Float[np.ndarray, "b columns columns"]
     seen: Float[np.ndarray, " b"]
     sound: Bool[np.ndarray, " b"]
-    shared: Float32[np.ndarray, "b columns shared"] | None = None
+    shared: Float[np.ndarray, "b columns shared"] | None = None
 
     @classmethod
     def of(cls, scaled: np.ndarray, unit: np.ndarray, sound: np.ndarray) -> "Information":
@@ -206,7 +206,7 @@ class Information:
         left = Information.of(self.scaled - own @ np.swapaxes(own, 1, 2), self.unit, self.sound)
         if self.shared is None:
             return left
-        return replace(left, shared=np.concatenate([self.shared, taken], axis=2, dtype=np.float32))
+        return replace(left, shared=np.concatenate([self.shared, taken], axis=2))
 
 
 def drop_of(known: Information, part: Part, product: np.ndarray):

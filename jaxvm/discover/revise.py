@@ -13,7 +13,7 @@ from jaxvm.discover.constants import sensible
 from jaxvm.discover.diagnosis import Finding
 from jaxvm.discover.hypotheses import FREE, Hypothesis
 from jaxvm.discover.rivals import Rival
-from jaxvm.discover.select import price, price_of_columns
+from jaxvm.discover.select import price, price_of_columns, spread_of
 from jaxvm.network.scene import Scene
 from jaxvm.physics.effects import Effect, room_for
 from jaxvm.solve.adjust import Adjustment
@@ -133,7 +133,8 @@ def _better(
     effects = list(scene.fitted_effects())
     effects[given + k] = other.effect(np.zeros(other.n_columns))
     # Even if it made all the others superfluous, it would have to come so far down.
-    saved = 0.5 * current.variance_factor * complexity(findings, current.variance_factor, n)
+    variance = current.variance_factor
+    saved = 0.5 * variance * complexity(current, findings, variance, n)
     tried = fit(scene.with_effects(tuple(effects), scene.room), wanted=current.cost + saved)
     if not (tried.converged and sensible(tried.scene, tried.scene.fitted_effects()[given + k])):
         return current, findings, k
@@ -148,7 +149,7 @@ def _better(
     new = with_effects(new, tried)
     variance = min(current.variance_factor, tried.variance_factor)
     gained = 2.0 * (current.cost - tried.cost) / variance
-    cost = complexity(new, variance, n) - complexity(findings, variance, n)
+    cost = complexity(tried, new, variance, n) - complexity(current, findings, variance, n)
     if not tried.converged or gained <= cost:
         return current, findings, k
     return tried, new, k - sum(j < k for j in needless)
@@ -198,11 +199,13 @@ def with_effects(findings: list[Finding], fitted: Adjustment) -> list[Finding]:
     ]
 
 
-def complexity(findings: list[Finding], variance: float, n: int) -> float:
-    """What the findings cost together."""
-    return sum(
-        price(f.hypothesis, f.drop, np.asarray(f.effect.amplitudes), variance, n) for f in findings
-    )
+def complexity(current: Adjustment, findings: list[Finding], variance: float, n: int) -> float:
+    """What the findings of a fit cost together."""
+    given, cost = given_effects(current, findings), 0.0
+    for k, f in enumerate(findings):
+        spread = spread_of(current, given + k, f.hypothesis)
+        cost += price(f.hypothesis, f.drop, np.asarray(f.effect.amplitudes), variance, n, spread)
+    return cost
 
 
 def _superfluous(current: Adjustment, findings: list[Finding], n: int) -> list[int]:

@@ -51,7 +51,7 @@ _STACKED = 32
 """Terms whose tangents are multiplied at a time, of as many groups as have them."""
 
 _MOST_KEPT = 30_000_000
-"""Numbers that are kept of what shared unknowns see of all hypotheses: 120 MB."""
+"""Numbers that are kept of what shared unknowns see of all hypotheses: 240 MB."""
 
 
 @dataclass(frozen=True)
@@ -212,7 +212,7 @@ class ScoreTests:
         valid = self.battery.families[key[0]].valid[key[1], part.courses, part.scope]
         known = information_of(tangents, part, shared, valid)
         keeps = self.battery.n_columns * shared.shape[2] <= _MOST_KEPT
-        return replace(known, shared=shared.astype(np.float32)) if keeps else known
+        return replace(known, shared=shared) if keeps else known
 
     def _wants_halves(self, key: tuple[int, int, int], tested: "_Tested") -> bool:
         """Whether a part asks for products with the model's own Jacobian."""

@@ -77,6 +77,11 @@ class Candidate:
         """Its refitted amplitudes."""
         return np.asarray(self.effect.amplitudes)
 
+    @property
+    def spread(self) -> np.ndarray | None:
+        """Their covariance, if the price depends on it."""
+        return spread_of(self.adjustment, -1, self.hypothesis)
+
 
 def decisive_gap(drop):
     """Gap in chi-square at which one of two hypotheses is out that explain an effect of a drop."""
@@ -145,10 +150,23 @@ def evidence(
 
 
 def price(
-    hypothesis: Hypothesis, drop: float, amplitudes: np.ndarray, variance: float, n: int
+    hypothesis: Hypothesis,
+    drop: float,
+    amplitudes: np.ndarray,
+    variance: float,
+    n: int,
+    spread: np.ndarray | None = None,
 ) -> float:
     """What a hypothesis costs: columns, constants, implausibility (on the scale of chi-square)."""
-    return drop / variance - evidence(hypothesis, drop, amplitudes, variance, n)
+    return drop / variance - evidence(hypothesis, drop, amplitudes, variance, n, spread)
+
+
+def spread_of(fitted: Adjustment, place: int, hypothesis: Hypothesis) -> np.ndarray | None:
+    """Covariance of the amplitudes of an effect of a fit, if its price depends on it."""
+    if not FORMS[hypothesis.course.form].one_course or len(hypothesis.group.terms) == 1:
+        return None
+    own, _ = fitted.scene.places()[place]
+    return amplitude_covariance(fitted, np.arange(own.start, own.stop))
 
 
 def price_of_columns(
@@ -258,11 +276,7 @@ def refit(base: Adjustment, hypothesis: Hypothesis, amplitudes, split: Split) ->
         return None
     variance = fitted.variance_factor
     drop = 2.0 * (base.cost - fitted.cost)
-    # What the terms of an effect may do apart from each other is told by their covariance.
-    spread = None
-    if FORMS[effect.form].one_course and 1 < len(hypothesis.group.terms):
-        place, _ = fitted.scene.places()[-1]
-        spread = amplitude_covariance(fitted, np.arange(place.start, place.stop))
+    spread = spread_of(fitted, -1, hypothesis)
     own = evidence(hypothesis, drop, np.asarray(effect.amplitudes), variance, split.n, spread)
     # Of several names for the same the size decides which comes first.
     named = best_named(hypothesis, np.asarray(effect.amplitudes))
