@@ -1,8 +1,17 @@
-"""For all tests."""
+"""For all tests.
+
+Tests wait for the compiler more than for anything else: they ask it for programs that are made
+quickly, not for the quickest ones. The demonstration, the notebooks and the benchmarks run what
+users run; JAX_DISABLE_MOST_OPTIMIZATIONS=0 has the tests do so, too.
+"""
+
+import os
 
 import pytest
 
-from jaxvm.compiling import forget_compiled_if_many
+os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")  # read when JAX is imported
+
+from jaxvm.compiling import forget_compiled_if_many  # noqa: E402
 
 
 @pytest.fixture(autouse=True, scope="module")
