@@ -220,23 +220,27 @@ def _folder() -> Path | None:
     return folder
 
 
-@functools.cache
 def _context() -> str:
     """What a program is made from, apart from its function and arguments."""
+    return repr((_sources(), _compiler()))
+
+
+@functools.cache
+def _sources() -> str:
     sources = sorted(Path(__file__).parent.rglob("*.py"))
     told = hashlib.sha256(b"".join(file.read_bytes() for file in sources)).hexdigest()
     others = [f"{module.__name__} {module.__version__}" for module in (eqx, optimistix, lineax, np)]
-    return repr((told, others, _compiler()))
+    return repr((told, others))
 
 
-@functools.cache
 def _compiler() -> str:
-    """What makes an executable of a program."""
+    """What makes an executable of a program; a user may set JAX up anew at any time."""
     settings = sorted((k, v) for k, v in jax.config.values.items() if "cache" not in k)
     versions = jax.__version__, jaxlib.__version__
     return repr((versions, settings, os.environ.get("XLA_FLAGS"), _machine()))
 
 
+@functools.cache
 def _machine() -> str:
     """The machine, by what its processor can do: executables are made for it."""
     try:

@@ -112,6 +112,21 @@ def test_other_sources_ask_for_the_same_executable(tmp_path, monkeypatch):
     assert len(set((tmp_path / "programs").iterdir()) - kept) == 1
 
 
+def test_another_setting_of_jax_is_another_program(tmp_path):
+    """Whatever is set in the middle of a process: what was made before is not taken for it."""
+    before = jax.config.values["jax_disable_most_optimizations"]
+    solved(np.eye(3), np.ones(3))
+    kept = set((tmp_path / "programs").iterdir())
+    _forget()
+    jax.config.update("jax_disable_most_optimizations", not before)
+    try:
+        solved(np.eye(3), np.ones(3))
+    finally:
+        jax.config.update("jax_disable_most_optimizations", before)
+    assert len(set((tmp_path / "programs").iterdir()) - kept) == 2
+    assert _traced == ["solved", "solved"]
+
+
 @pytest.mark.parametrize("damage", [b"", b"not a program", None])
 def test_a_damaged_file_is_made_again(tmp_path, damage):
     x = np.ones(3)

@@ -57,6 +57,14 @@ def test_noise_loses_as_many_as_there_are_unknowns_less():
     assert lost_by_one_course(clean, spread, 2) < 1e-9
 
 
+@pytest.mark.parametrize("spread", [np.ones((4, 4)), np.diag([1.0, 1.0, 0.0, 1.0]),
+                                    np.diag([1.0, 1.0, np.nan, 1.0])])  # fmt: skip
+def test_what_is_not_determined_saves_nothing(spread):
+    along = np.array([6.0, 12.0, 3.0, 6.0])
+    assert lost_by_one_course(along, spread, 2) == np.inf
+    assert price_of_columns(LAGS, along, 300.0, 1000, spread) == pytest.approx(4.0 * np.log(1000))
+
+
 def test_a_state_of_its_own_is_one_unknown():
     n, drop = 10_000, 300.0
     spread = np.diag([1.0, 1.0, 4.0, 4.0])

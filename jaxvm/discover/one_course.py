@@ -29,12 +29,16 @@ def lost_by_one_course(
 
     Returns:
         The least (a - u v)^T C^-1 (a - u v), by alternating least squares from the course of each
-        term and of their sum.
+        term and of their sum; infinite where amplitudes are not determined.
     """
-    table = np.reshape(amplitudes, (-1, n_bases))
-    scale = np.sqrt(np.diag(spread))
-    whole = np.linalg.inv(spread / np.outer(scale, scale))
-    root = np.linalg.cholesky(whole).T / scale
+    table, variances = np.reshape(amplitudes, (-1, n_bases)), np.diag(spread)
+    if not (np.isfinite(spread).all() and np.all(variances > 0.0)):
+        return np.inf
+    scale = np.sqrt(variances)
+    try:
+        root = np.linalg.inv(np.linalg.cholesky(spread / np.outer(scale, scale))) / scale
+    except np.linalg.LinAlgError:
+        return np.inf
     return min(_lost(np.ravel(table), root, course) for course in (*table, table.sum(axis=0)))
 
 
