@@ -143,12 +143,14 @@ def _of_quantity(driver: str, channels: Channels, lags: list[float]) -> list[Cou
             for form in ("lag", "lag with state")
             for tau in lags
         ),
-        *(Course(driver, "delay", (dead_time,), reference) for dead_time in lags[:3]),
+        Course(driver, "lag", (_quick(lags)[-1],), reference),
+        *(Course(driver, "delay", (late,), reference) for late in (*_quick(lags), *lags[:3])),
         Course(driver, "two lags", (lags[1], lags[4]), reference),
         Course(driver, "proportional"),
         Course(driver, "square"),
         Course(driver, "rate"),
-        *(Course(driver, "transient", (tau,)) for tau in lags[:4]),
+        # What evens out in less than a step between epochs follows the rate late.
+        *(Course(driver, "transient", (tau,)) for tau in (*_quick(lags), *lags[:4])),
         *(Course(driver, "transient with state", (tau,)) for tau in lags),
         *(
             Course(driver, "direction", (share * rate + 1e-12, tau))
@@ -165,6 +167,11 @@ def _of_quantity(driver: str, channels: Channels, lags: list[float]) -> list[Cou
         ),
         *_hysteresis(driver, width, reference),
     ]
+
+
+def _quick(lags: list[float]) -> list[float]:
+    """Lags shorter than those of the grid, as far as logs between epochs tell them."""
+    return [0.15 * lags[0], 0.4 * lags[0]]
 
 
 def _of_own(driver: str, channels: Channels, lags: list[float]) -> list[Course]:
