@@ -76,7 +76,7 @@ def test_a_state_of_its_own_is_one_unknown():
     # What the residuals scatter more, amplitudes that are apart mean less.
     wide = price_of_columns(LAGS, apart, drop, n, 400.0 * spread)
     assert fewer < wide < 4.0 * np.log(n)
-    gained = [evidence(LAGS, drop, along, 2.0, n, known) for known in (None, spread)]
+    gained = [evidence(LAGS, drop, along, 2.0, n, known) for known in (None, 2.0 * spread)]
     assert gained[1] - gained[0] == pytest.approx(np.log(n))
 
 

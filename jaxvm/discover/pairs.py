@@ -13,7 +13,7 @@ from jaxvm.discover.hypotheses import FREE, Hypothesis
 from jaxvm.discover.ranking import Ranking
 from jaxvm.discover.revise import complexity
 from jaxvm.discover.score import ScoreTests
-from jaxvm.discover.select import DECIDED, Candidate, price, refit, shortlist
+from jaxvm.discover.select import DECIDED, Candidate, price, refit, shortlist, spread_of
 from jaxvm.solve.adjust import Adjustment
 from jaxvm.solve.snooping import robust_variance
 
@@ -92,10 +92,10 @@ def better_pair(
         variance = min(current.variance_factor, pair[1].adjustment.variance_factor)
         drops = [2.0 * (plain.cost - pair[0].adjustment.cost)]
         drops.append(2.0 * (pair[0].adjustment.cost - pair[1].adjustment.cost))
-        costs = [
-            price(c.hypothesis, drop, c.amplitudes, variance, parts.n, c.spread)
-            for c, drop in zip(pair, drops, strict=True)
-        ]
+        costs = []
+        for c, drop in zip(pair, drops, strict=True):
+            spread = spread_of(c.adjustment, -1, c.hypothesis, variance)
+            costs.append(price(c.hypothesis, drop / variance, c.amplitudes, parts.n, spread))
         gained = 2.0 * (current.cost - pair[1].adjustment.cost) / variance
         gained += complexity(current, findings, variance, parts.n) - sum(costs)
         if gained > least:

@@ -203,8 +203,8 @@ def complexity(current: Adjustment, findings: list[Finding], variance: float, n:
     """What the findings of a fit cost together."""
     given, cost = given_effects(current, findings), 0.0
     for k, f in enumerate(findings):
-        spread = spread_of(current, given + k, f.hypothesis)
-        cost += price(f.hypothesis, f.drop, np.asarray(f.effect.amplitudes), variance, n, spread)
+        spread = spread_of(current, given + k, f.hypothesis, variance)
+        cost += price(f.hypothesis, f.drop / variance, f.effect.amplitudes, n, spread)
     return cost
 
 

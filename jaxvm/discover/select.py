@@ -77,11 +77,6 @@ class Candidate:
         """Its refitted amplitudes."""
         return np.asarray(self.effect.amplitudes)
 
-    @property
-    def spread(self) -> np.ndarray | None:
-        """Their covariance, if the price depends on it."""
-        return spread_of(self.adjustment, -1, self.hypothesis)
-
 
 def decisive_gap(drop):
     """Gap in chi-square at which one of two hypotheses is out that explain an effect of a drop."""
@@ -133,40 +128,36 @@ def evidence(
     n: int,
     spread: np.ndarray | None = None,
 ) -> float:
-    """Evidence of a hypothesis from its drop of chi-square.
+    """Evidence of a hypothesis from its drop of chi-square, for a variance of unit weight.
+
+    `spread` is the covariance of the amplitudes for that variance, where they were fitted.
+    """
+    return drop / variance - price(hypothesis, drop / variance, amplitudes, n, spread)
+
+
+def price(
+    hypothesis: Hypothesis, drop: float, amplitudes, n: int, spread: np.ndarray | None = None
+) -> float:
+    """What a hypothesis costs: columns, constants, implausibility (on the scale of chi-square).
 
     Each constant that is refined costs what the drop lets it be known by (Laplace): next to nothing
-    where any value does, as much as a column where one value alone does. `spread` is the covariance
-    of the amplitudes, where they were fitted, for unit variance.
+    where any value does, as much as a column where one value alone does.
     """
-    drop = drop / variance
     own = FORMS[hypothesis.course.form].constants[: len(hypothesis.course.constants)]
     refined = min(np.log1p(_SHARP * max(drop, 0.0)), np.log(n))
     constants = sum(refined if constant.refined else np.log(n) for constant in own)
     prior = log_prior(hypothesis, np.asarray(amplitudes))
-    known = None if spread is None else variance * spread
-    columns = price_of_columns(hypothesis, amplitudes, drop, n, known)
-    return drop - columns - constants + 2.0 * prior
+    return price_of_columns(hypothesis, amplitudes, drop, n, spread) + constants - 2.0 * prior
 
 
-def price(
-    hypothesis: Hypothesis,
-    drop: float,
-    amplitudes: np.ndarray,
-    variance: float,
-    n: int,
-    spread: np.ndarray | None = None,
-) -> float:
-    """What a hypothesis costs: columns, constants, implausibility (on the scale of chi-square)."""
-    return drop / variance - evidence(hypothesis, drop, amplitudes, variance, n, spread)
-
-
-def spread_of(fitted: Adjustment, place: int, hypothesis: Hypothesis) -> np.ndarray | None:
+def spread_of(
+    fitted: Adjustment, place: int, hypothesis: Hypothesis, variance: float
+) -> np.ndarray | None:
     """Covariance of the amplitudes of an effect of a fit, if its price depends on it."""
     if not FORMS[hypothesis.course.form].one_course or len(hypothesis.group.terms) == 1:
         return None
     own, _ = fitted.scene.places()[place]
-    return amplitude_covariance(fitted, np.arange(own.start, own.stop))
+    return variance * amplitude_covariance(fitted, np.arange(own.start, own.stop))
 
 
 def price_of_columns(
@@ -276,7 +267,7 @@ def refit(base: Adjustment, hypothesis: Hypothesis, amplitudes, split: Split) ->
         return None
     variance = fitted.variance_factor
     drop = 2.0 * (base.cost - fitted.cost)
-    spread = spread_of(fitted, -1, hypothesis)
+    spread = spread_of(fitted, -1, hypothesis, variance)
     own = evidence(hypothesis, drop, np.asarray(effect.amplitudes), variance, split.n, spread)
     # Of several names for the same the size decides which comes first.
     named = best_named(hypothesis, np.asarray(effect.amplitudes))

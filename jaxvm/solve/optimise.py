@@ -202,8 +202,8 @@ def minimise(
     info = _as_info(normal)
     y, state = _begin(solver, info)
     y, state = _advance(solver, y, state, info)
-    curved = problem if isinstance(problem, Problem) else None
-    curved = curved if isinstance(solver.search, Relaxing) else None
+    follows = isinstance(solver.search, Relaxing)
+    curved = problem if follows and isinstance(problem, Problem) else None
     doubts, here = 0, None
     while not (bool(state.done) or (np.isfinite(wanted) and _out_of_reach(state, wanted))):
         if curved is None:
