@@ -106,6 +106,8 @@ ALIKE = (
     {"range-scale", "range-air"},
     # Both go with the sign of the rate.
     {"mount-hysteresis", "beam-warms-unevenly"},
+    # While the temperature changes beam and mount turn the camera alike.
+    {"beam-warms-unevenly", "mount-lags"},
     # The image scales alike, whether glass or firmware does it.
     {"focal-drift", "device-compensates"},
     # Centroids of lopsided spots move as if the lens distorted.

@@ -59,6 +59,13 @@ MOUNT: tuple[Entry, ...] = (
         "it bends. The turn follows the rate of the temperature and changes sign with it.",
     ),
     Entry(
+        "mount-lags", "the camera turns while its mount lags behind its surroundings", (25, 81),
+        _TURN, ("temperature",), CHANGING, "camera",
+        (1e-7, 2e-4), "a beam that bends while it warms", "log the temperature of the mount itself",
+        "The mount turns the camera by the difference between its own temperature, which nobody "
+        "logs, and that of its surroundings. The turn is there while the temperature changes.",
+    ),
+    Entry(
         "station-beam-bends", "the beam between the cameras of a station bends", (27,),
         _OPPOSED, ("irradiance", "gradient", "temperature"),
         (*THERMAL, *CHANGING, "direction"), "station",
