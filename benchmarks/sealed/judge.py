@@ -140,6 +140,7 @@ def _effect(
     own_best = max((power["evidence"][name] for name in own_names), default=-np.inf)
     priced = own_best - max((power["evidence"][name] for name in rivals), default=-1e300)
     nearest = min(gaps, key=gaps.__getitem__, default="")
+    by_name = [drop for name, drop in power["drops"].items() if name]
     is_shown = power["expected_drop"] >= SHOWN
     result = {
         "effect": truth["effect"],
@@ -153,6 +154,7 @@ def _effect(
         "wrongly_first": _wrongly_first(found, alike, power["drops"]),
         "nearest": nearest,
         "gap": gaps.get(nearest),
+        "doubles": max(1, sum(power["expected_drop"] - d < DECIDED for d in by_name)),
         "shown": is_shown,
         "decidable": is_shown and all(gap >= DECIDED for gap in gaps.values()),
         "decidable_by_names": is_shown and bool(ahead >= DECIDED),

@@ -142,6 +142,10 @@ def figures(rows: list[dict]) -> list[Figure]:
         _level("3a", "size of the set (names), median", sizes, 0.5, "at most 2", 2.0),
         _level("3b", "size of the set, 90th percentile", sizes, 0.9, "at most 5", 5.0),
         _level("3c", "names and places in the set, 90th percentile", claims, 0.9, ""),
+        _level(
+            "3d", "names with a gap below 2 ln 20: what the recordings leave open, 90th percentile",
+            [e["doubles"] for r in inside for e in r["effects"] if e["detected"]], 0.9, "",
+        ),
         _share(
             "4", "right place and instant where the right name is in the set",
             [e["place_right"] for _, e in shown if e["in_set"]], 0.97,
