@@ -173,7 +173,8 @@ def _searched(
     """A search that is through, the plain fit and its held-out errors, and the gross errors.
 
     What is found may have concealed gross errors, which end a search once they show: signs that
-    flip leave them as large as they are. It begins again without them.
+    flip leave them as large as they are. It begins again without them, and what it found before
+    needs no last names.
     """
     parts, plain, n_rejected = _plain_fit(scene, every)
     begun = 0
@@ -181,11 +182,22 @@ def _searched(
         plain, heldout = parts.proven(plain)
         found, begun = Search(parts, plain, heldout, len(scene.effects), alpha, seed), begun + 1
         found.run(most, progress)
-        _, cleaner, n = without_gross_errors(found.current, parts)
-        if not (found.findings and n) or begun == _BEGINNINGS:
-            return found, plain, heldout, n_rejected
+        cleaner, n = _laid_bare(found)
+        if not n or begun == _BEGINNINGS:
+            found.settle()
+            cleaner, n = _laid_bare(found)
+            if not n or begun == _BEGINNINGS:
+                return found, plain, heldout, n_rejected
         progress(f"{n} gross errors show beside what was found: beginning again without them")
         parts, n_rejected, plain = cleaner, n, cleaner.fit(scene)
+
+
+def _laid_bare(found: Search) -> tuple[Split, int]:
+    """The split without the gross errors that show beside what was found, and their number."""
+    if not found.findings:
+        return found.parts, 0
+    _, cleaner, n = without_gross_errors(found.current, found.parts)
+    return cleaner, n
 
 
 def _plain_fit(scene: Scene, every: int) -> tuple[Split, Adjustment, int]:

@@ -77,7 +77,10 @@ class Search:
         self._tests = ScoreTests.of(self.current, families)
 
     def run(self, most: int, progress: Callable[[str], None]) -> None:
-        """Search until nothing significant is left, at most so many findings are made."""
+        """Search until nothing significant is left, at most so many findings are made.
+
+        They have the names under which they were found until the search is settled.
+        """
         plain, heldout = self.current, self.heldout
         first = self._search(most, progress)
         # What noise with a memory explains needs no other pair.
@@ -91,7 +94,6 @@ class Search:
                 self._hopeless, self._superfluous = set(), set()
                 self._take_pair(pair, progress)
                 self._search(most, progress)
-        self._settle()
 
     def _search(self, most: int, progress: Callable[[str], None]) -> Ranking:
         """Take one effect after the other; returns the first scores."""
@@ -327,7 +329,7 @@ class Search:
 
         return [again(finding, met) for finding, met in zip(found, own, strict=True)]
 
-    def _settle(self) -> None:
+    def settle(self) -> None:
         """Drop what noise with a memory explains, and give the findings their last names."""
         parts = self.parts
         # What a finding that goes had taken of the noise counts for the others again.
