@@ -1,5 +1,6 @@
 """Single wrong marks are set aside, all of them and no others; physics is not."""
 
+import importlib
 from dataclasses import replace
 
 import numpy as np
@@ -91,7 +92,11 @@ def test_sound_marks_all_stay(known):
     assert abs(fitted.variance_factor - 1.0) < 4.0 * np.sqrt(2.0 / fitted.degrees_of_freedom)
 
 
-def test_what_an_effect_conceals_is_set_aside_when_it_is_found(known):
+@pytest.mark.parametrize("beginnings", [2, 1])
+def test_what_an_effect_conceals_is_set_aside_when_it_is_found(known, beginnings, monkeypatch):
+    """By beginning again without it, or where the search stands if it may not begin again."""
+    module = importlib.import_module("jaxvm.discover.diagnose")
+    monkeypatch.setattr(module, "_BEGINNINGS", beginnings)
     obs, rng = known.recording.observations, np.random.default_rng(7)
     bent = Effect(
         "bent", (Term("target.bow_x"),), "constant", "constant", (), 0.0,
@@ -106,7 +111,7 @@ def test_what_an_effect_conceals_is_set_aside_when_it_is_found(known):
     told: list[str] = []
     found, plain, _, count = _searched(scene, 3, 0.01, 0, 8, told.append)
     assert np.array_equal(set_aside(plain, found.parts), wrong) and count == len(wrong)
-    assert sum("beginning again" in line for line in told) == 1
+    assert sum("beginning again" in line for line in told) == beginnings - 1
     (finding,) = found.findings
     assert finding.hypothesis.entries[0].id == "target-bow"
     assert abs(finding.effect.amplitudes[0] - 6e-3) < 5.0 * finding.stds[0]

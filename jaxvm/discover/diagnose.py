@@ -40,7 +40,7 @@ from jaxvm.solve.adjust import Adjustment, adjust, reference_sigma
 from jaxvm.solve.covariance import effect_deviations
 from jaxvm.solve.snooping import robust_variance
 
-_BEGINNINGS = 3
+_BEGINNINGS = 2
 """Times that the search begins, without the gross errors that showed at the end of the last."""
 
 ROOM = (16, 8)
@@ -174,7 +174,8 @@ def _searched(
 
     What is found may have concealed gross errors, which end a search once they show: signs that
     flip leave them as large as they are. It begins again without them, and what it found before
-    needs no last names.
+    needs no last names. The few that show only beside what it then finds are set aside where it
+    stands.
     """
     parts, plain, n_rejected = _plain_fit(scene, every)
     begun = 0
@@ -183,7 +184,11 @@ def _searched(
         found, begun = Search(parts, plain, heldout, len(scene.effects), alpha, seed), begun + 1
         found.run(most, progress)
         cleaner, n = _laid_bare(found)
-        if not n or begun == _BEGINNINGS:
+        if n and begun == _BEGINNINGS:
+            found.set_aside(cleaner)
+            plain, heldout = cleaner.proven(cleaner.fit(scene))
+            n_rejected, n = n, 0
+        if not n:
             found.settle()
             cleaner, n = _laid_bare(found)
             if not n or begun == _BEGINNINGS:
