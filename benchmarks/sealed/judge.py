@@ -154,7 +154,7 @@ def _effect(
         "wrongly_first": _wrongly_first(found, alike, power["drops"]),
         "nearest": nearest,
         "gap": gaps.get(nearest),
-        "doubles": max(1, sum(power["expected_drop"] - d < DECIDED for d in by_name)),
+        "doubles": max(1, sum(bool(power["expected_drop"] - d < DECIDED) for d in by_name)),
         "shown": is_shown,
         "decidable": is_shown and all(gap >= DECIDED for gap in gaps.values()),
         "decidable_by_names": is_shown and bool(ahead >= DECIDED),
