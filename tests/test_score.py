@@ -172,6 +172,30 @@ def test_the_null_distribution_is_that_of_residuals_with_other_signs(stereo):
         assert tests.score(lost, residual=flipped).best_z() == pytest.approx(largest, rel=1e-4)
 
 
+def test_what_is_left_elsewhere_is_no_noise_of_a_place(stereo):
+    """An image that jumps makes signs that flip surprising, less so where they can't follow it."""
+    scene, rng = stereo.scene, np.random.default_rng(1)
+    obs = scene.recording.observations
+    signs = random_signs(len(scene.recording.time), 99, 0)
+    jump = rng.normal(size=(len(scene.recording.time), 2))
+    pixels = np.concatenate([(obs.camera == 0)[own, None] * jump[obs.epoch[own]]
+                             for own in scene.tables])  # fmt: skip
+    residual = stacked(stereo)
+    residual[: len(pixels), :2] += 3.0 * pixels
+    tests = ScoreTests.of(stereo, enumerate_hypotheses(scene))
+    found = tests.score(1.0, signs, residual)
+    groups = [group for scores in found.scores for group in scores.family.groups]
+
+    def of(*ports):
+        return next(g for g in groups if {term.port for term in g.terms} == {*ports})
+
+    z = float(np.median(found.null))
+    assert found.p_value(z) == pytest.approx(0.5, abs=0.1)
+    assert found.p_at(z, of("target.scale_x")) == 0.01
+    assert found.p_at(z, of("sensor.cx", "sensor.cy")) > 0.1
+    assert all(found.p_at(z, group) <= found.p_value(z) for group in groups)
+
+
 def test_a_surprise_is_the_log_of_a_tail():
     from scipy.stats import chi2
 

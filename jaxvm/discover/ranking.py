@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import gammaln
 
+from jaxvm.discover.groups import Group
 from jaxvm.discover.hypotheses import Family, Hypothesis
 from jaxvm.discover.space import member
 from jaxvm.network.scene import Scene
@@ -99,6 +100,12 @@ class Ranking:
     def p_value(self, z: float) -> float:
         """Probability that noise alone gives a statistic this large anywhere (family-wise)."""
         return float((1 + np.sum(self.null >= z)) / (1 + len(self.null)))
+
+    def p_at(self, z: float, group: Group) -> float:
+        """The same for the terms of one group alone: any course, any body."""
+        own = [s.null[g] for s in self.scores for g, o in enumerate(s.family.groups) if o == group]
+        most = np.max(own, axis=0) if own else self.null
+        return float((1 + np.sum(most >= z)) / (1 + len(most)))
 
 
 def surprise(
