@@ -10,6 +10,7 @@ from test_steps import dense
 
 from jaxvm.discover import products
 from jaxvm.discover.battery import Part, Place
+from jaxvm.discover.groups import Group
 from jaxvm.discover.noise import random_signs
 from jaxvm.discover.products import Tangents, whitener_of
 from jaxvm.discover.ranking import surprise
@@ -194,6 +195,8 @@ def test_what_is_left_elsewhere_is_no_noise_of_a_place(stereo):
     assert found.p_at(z, of("target.scale_x")) == 0.01
     assert found.p_at(z, of("sensor.cx", "sensor.cy")) > 0.1
     assert all(found.p_at(z, group) <= found.p_value(z) for group in groups)
+    unscored = Group((Term("detect.u", "tile"),), "camera")
+    assert unscored not in groups and found.p_at(z, unscored) == found.p_value(z)
 
 
 def test_a_surprise_is_the_log_of_a_tail():

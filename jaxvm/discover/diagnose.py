@@ -182,16 +182,17 @@ def _searched(
     while True:
         plain, heldout = parts.proven(plain)
         found, begun = Search(parts, plain, heldout, len(scene.effects), alpha, seed), begun + 1
+        is_last = begun == _BEGINNINGS
         found.run(most, progress)
         cleaner, n = _laid_bare(found)
-        if n and begun == _BEGINNINGS:
+        if n and is_last:
             found.set_aside(cleaner)
             plain, heldout = cleaner.proven(cleaner.fit(scene))
             n_rejected, n = n, 0
         if not n:
             found.settle()
-            cleaner, n = _laid_bare(found)
-            if not n or begun == _BEGINNINGS:
+            cleaner, n = (found.parts, 0) if is_last else _laid_bare(found)
+            if not n:
                 return found, plain, heldout, n_rejected
         progress(f"{n} gross errors show beside what was found: beginning again without them")
         parts, n_rejected, plain = cleaner, n, cleaner.fit(scene)

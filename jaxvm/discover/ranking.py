@@ -70,8 +70,7 @@ class Ranking:
                 own = [s for s, other in enumerate(scores.family.scopes) if other == scope]
                 z = np.where(scores.valid[g][:, own], scores.z[g][:, own], -np.inf)
                 if {term.port for term in group.terms} <= ports and np.isfinite(z).any():
-                    null = scores.null[g]
-                    p = min(p, float((1 + np.sum(null >= z.max())) / (1 + len(null))))
+                    p = min(p, _p_value(z.max(), scores.null[g]))
                     families += 1
         return min(p * max(families, 1), 1.0)
 
@@ -99,13 +98,24 @@ class Ranking:
 
     def p_value(self, z: float) -> float:
         """Probability that noise alone gives a statistic this large anywhere (family-wise)."""
-        return float((1 + np.sum(self.null >= z)) / (1 + len(self.null)))
+        return _p_value(z, self.null)
 
     def p_at(self, z: float, group: Group) -> float:
-        """The same for the terms of one group alone: any course, any body."""
+        """The same for the terms of one group alone: any course, any body.
+
+        Of what was not scored among the others (a wave, amounts of every image): anywhere.
+        """
         own = [s.null[g] for s in self.scores for g, o in enumerate(s.family.groups) if o == group]
-        most = np.max(own, axis=0) if own else self.null
-        return float((1 + np.sum(most >= z)) / (1 + len(most)))
+        return _p_value(z, np.max(own, axis=0) if own else self.null)
+
+    def is_beyond_gaussian(self, z: float, alpha: float) -> bool:
+        """Whether Gaussian noise gives a statistic this large anywhere less often than alpha."""
+        return z > 2.0 * np.log(self.n / alpha)
+
+
+def _p_value(z: float, null: np.ndarray) -> float:
+    """Probability of a statistic this large, by those of random repetitions."""
+    return float((1 + np.sum(null >= z)) / (1 + len(null)))
 
 
 def surprise(

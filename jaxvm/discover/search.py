@@ -197,7 +197,7 @@ class Search:
         left over.
         """
         z = self.ranking.best_z()
-        if z < 2.0 * np.log(self.ranking.n / self.alpha):
+        if not self.ranking.is_beyond_gaussian(z, self.alpha):
             return self.p_value
         without = refit(self.current, hypothesis, amplitudes, self.parts)
         if without is None:
@@ -326,9 +326,9 @@ class Search:
         def again(finding: Finding, met: Met) -> Finding:
             z = float(surprise(np.array(finding.drop / variance / met.inflation), met.freedom))
             p = left.p_value(z)
-            if z > 2.0 * np.log(left.n / self.alpha):
-                # Gaussian noise gives that nowhere: what has another cause, and is still to be
-                # found, speaks against it only as far as it may be taken for it.
+            if left.is_beyond_gaussian(z, self.alpha):
+                # What gives as much has another cause, which is still to be found: it speaks
+                # against the finding only as far as it may be taken for it.
                 p = min(p, left.p_at(z, finding.hypothesis.group))
             return replace(finding, p_value=max(p, finding.p_independent))
 
