@@ -335,10 +335,9 @@ class Search:
         return [again(finding, met) for finding, met in zip(found, own, strict=True)]
 
     def set_aside(self, parts: Split) -> None:
-        """Go on without some more observations, with everything that was found."""
+        """Go on without some more observations, with everything that was found, as it was found."""
         self.parts = parts
         self.current, self.heldout = parts.proven(parts.fit(self.current.scene))
-        self.findings = with_effects(self.findings, self.current)
         self._score()
         self.findings = self._confirmed()
 
