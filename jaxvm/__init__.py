@@ -8,9 +8,12 @@ need it. The settings below are made unless the environment already has them:
 - OpenBLAS must not start threads for matrices of 30 rows: it made them 200 times slower.
 - XLA's own threads inside one operation bring nothing for the many small blocks here.
 - XLA's fusion emitters double the time of compiling and save a sixth of the time of running; a
-  diagnosis of a recording of a new size is mostly compiling.
+  diagnosis of a recording of a new size is mostly compiling. From jaxlib 0.11.1 on there is no
+  choice, and a process that asks for one ends at once.
 - XLA drops optimization barriers before it fuses loops, and then computes a derivative again in
-  every loop that needs it: barriers stay.
+  every loop that needs it: barriers stay. XLA's compilers for accelerators end with an error where
+  they do, and that of jaxlib 0.12 for processors ends the process: with it, and where an
+  accelerator may be found (a plugin of JAX, unless JAX_PLATFORMS is cpu), they go.
 - The C library gives blocks of some MB back to the system and takes the next ones anew, page
   by page, which costs more than what is computed in them: up to 64 MB they are kept, for all
   threads together.
@@ -24,16 +27,24 @@ its user alone.
 import ctypes
 import os
 import sys
+from importlib.util import find_spec
+
+import jaxlib.version
 
 from jaxvm import interrupted
 
 interrupted.heard_by_the_command()
 
-for _flag, _value in {
-    "--xla_cpu_multi_thread_eigen": "false",
-    "--xla_cpu_use_fusion_emitters": "false",
-    "--xla_disable_hlo_passes": "cse_barrier_expander",
-}.items():
+_jaxlib = jaxlib.version.__version_info__
+_on_processors = os.environ.get("JAX_PLATFORMS") == "cpu" or not (
+    find_spec("jax_plugins") or find_spec("libtpu")
+)
+_flags = {"--xla_cpu_multi_thread_eigen": "false"}
+if _jaxlib < (0, 11, 1):
+    _flags["--xla_cpu_use_fusion_emitters"] = "false"
+if _jaxlib < (0, 12) and _on_processors:
+    _flags["--xla_disable_hlo_passes"] = "cse_barrier_expander"
+for _flag, _value in _flags.items():
     if _flag not in os.environ.get("XLA_FLAGS", ""):
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_flag}={_value}".strip()
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

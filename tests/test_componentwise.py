@@ -1,5 +1,7 @@
 """Functions of one row over whole tables, number by number, against `jax.vmap`."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -39,6 +41,8 @@ def several(a, b):
         "none": jnp.zeros((2, 0)),
         "padded": jax.lax.pad(a[:4].reshape(2, 2), b[0], [(1, 0, 0), (-1, 2, 1)]),
         "split": jnp.split(b, [2, 3]),
+        "numbers": functools.reduce(lambda x, y: x**2 + y, jnp.unstack(b)),
+        "columns": jnp.unstack(jnp.outer(a, b), axis=1)[1],
         "whole": jnp.linalg.norm(a) ** 3 + jnp.round(b[0]),
         "turned": jnp.flip(jnp.outer(a, b)[1:5:2], 1).T,
     }

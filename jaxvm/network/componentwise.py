@@ -340,7 +340,9 @@ _MOVES: dict[str, Callable] = {
     "stack": lambda *parts, axis, **_: np.stack(parts, axis=axis),
     "stop_gradient": lambda x: x,
     "transpose": lambda x, *, permutation: x.transpose(permutation),
-    "unstack": lambda x, *, axis, **_: np.moveaxis(x, axis, 0),
+    "unstack": lambda x, *, axis, **_: [
+        part.squeeze(axis) for part in np.split(x, x.shape[axis], axis)
+    ],
 }
 
 _RULES: dict[str, Callable] = {

@@ -1,0 +1,40 @@
+"""What the package sets for XLA before JAX is there, in processes of their own."""
+
+import os
+import subprocess
+import sys
+from importlib.util import find_spec
+
+import pytest
+
+
+def flags(**env) -> str:
+    """XLA_FLAGS after the import, in a fresh environment."""
+    unset = ("XLA_FLAGS", "JAX_PLATFORMS")
+    known = {name: value for name, value in os.environ.items() if name not in unset}
+    said = subprocess.run(
+        [sys.executable, "-c", "import jaxvm, os; print(os.environ['XLA_FLAGS'])"],
+        env=known | env,
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    return said.stdout
+
+
+@pytest.mark.skipif(find_spec("jax_plugins") is not None, reason="JAX has a plugin here")
+@pytest.mark.parametrize("plugin", ["jax_plugins", "libtpu"])
+def test_barriers_stay_on_processors_alone(tmp_path, plugin):
+    """The compilers for accelerators end with an error at a barrier that is still there."""
+    (tmp_path / plugin).mkdir()
+    path = {"PYTHONPATH": str(tmp_path)}
+    assert "cse_barrier_expander" in flags()
+    assert "cse_barrier_expander" not in flags(**path)
+    assert "cse_barrier_expander" in flags(**path, JAX_PLATFORMS="cpu")
+
+
+def test_what_the_user_sets_stays():
+    own = "--xla_cpu_multi_thread_eigen=true --xla_disable_hlo_passes=none"
+    found = flags(XLA_FLAGS=own)
+    assert found.startswith(own) and "cse_barrier_expander" not in found
+    assert found.count("--xla_cpu_multi_thread_eigen") == 1
