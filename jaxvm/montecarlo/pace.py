@@ -11,6 +11,9 @@ from pathlib import Path
 import jax
 
 _FIRST, _FACTOR = 64, 4
+_FIRST_ON_ACCELERATORS = 4096
+"""A batch of an accelerator takes as long as one of a single trial until it is full."""
+
 _LARGEST = 1 << 16
 _GAIN = 1.05
 """A larger batch is worth its memory when it is so many times as fast."""
@@ -31,7 +34,8 @@ class Pace:
         """`batch` fixes it; None lets it be found."""
         self._devices = devices
         self.found = batch is not None
-        first = min(_FIRST * devices, max(trials, 1))
+        begin = _FIRST if jax.default_backend() == "cpu" else _FIRST_ON_ACCELERATORS
+        first = min(begin * devices, max(trials, 1))
         self.batch = self._whole(first if batch is None else batch)
         self._seconds: dict[int, float] = {}  # of a trial, the best of each size
         self._before, self._compiling = 0, 0.0

@@ -83,7 +83,8 @@ class Traced(eqx.Module):
 
     def batch(self, key, numbers, mesh=None) -> Trial:
         if self.single:
-            with jax.enable_x64(False):
+            # Accelerators multiply float32 as TF32 or bfloat16, of three digits, unless told not to.
+            with jax.enable_x64(False), jax.default_matmul_precision("highest"):
                 return self._batch(key, numbers.astype(np.int32), mesh)
         return self._batch(key, numbers, mesh)
 
