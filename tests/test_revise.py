@@ -11,7 +11,7 @@ from jaxvm.discover.diagnose import _plain_fit
 from jaxvm.discover.groups import Group
 from jaxvm.discover.hypotheses import Hypothesis
 from jaxvm.discover.naming import Naming
-from jaxvm.discover.revise import followed, follows, likelier, prune
+from jaxvm.discover.revise import followed, follows, hidden, likelier, lost_without, prune
 from jaxvm.discover.rivals import Rival
 from jaxvm.discover.score import ScoreTests
 from jaxvm.discover.space import enumerate_hypotheses
@@ -54,44 +54,56 @@ def known():
     return board_recording(n_epochs=N_EPOCHS, free=frozenset())
 
 
-def pruned(known, jump, hunting, seed=3, idle=()):
-    """Names left of a jump of the focal length, idle effects, and amounts of every image."""
+def fitted(known, effects, rng):
+    """A camera before a board that is known, with effects; its fit, and how it is fitted."""
     (board,) = known.recording.model.targets
     held = replace(board, pose=known.truth["carrier_from_target"], free=frozenset())
     recording = known.with_model(targets=(held,))
-    instant = float(np.mean(recording.time[11:13]))
-    rng = np.random.default_rng(seed)
-    step = Effect("jump", (Term("sensor.focal"),), "time", "step", (instant,), 0.0, CAMERA, (jump,))
-    every = tuple(hunting * rng.standard_normal(N_EPOCHS))
-    hunts = Effect("hunts", AMOUNTS, scope=CAMERA, amplitudes=every, spread=6e-3)
     room = (N_EPOCHS + 8, 4)
-    truth = known.true_scene(recording).with_effects((step, *idle, hunts), room)
     obs = recording.observations
-    pixel = predicted(truth)
+    pixel = predicted(known.true_scene(recording).with_effects(effects, room))
     pixel += obs.sigma[:, None] * rng.standard_normal(pixel.shape)
     drawn = replace(recording, observations=replace(obs, pixel=pixel))
-    scene = known.true_scene(drawn).with_effects((step, *idle, hunts), room)
+    scene = known.true_scene(drawn).with_effects(effects, room)
     weights = tuple(np.ones(len(rows)) for rows in scene.tables)
-    current = refitted(scene, weights)
+    return refitted(scene, weights), lambda scene: refitted(scene, weights)
+
+
+def stepping(known, port, size):
+    """A step in the middle of the recording."""
+    instant = float(np.mean(known.recording.time[11:13]))
+    return Effect("jump", (Term(port),), "time", "step", (instant,), 0.0, CAMERA, (size,))
+
+
+def hunting(size, rng):
+    """An amount of every image."""
+    every = tuple(size * rng.standard_normal(N_EPOCHS))
+    return Effect("hunts", AMOUNTS, scope=CAMERA, amplitudes=every, spread=6e-3)
+
+
+def pruned(known, jump, hunts, seed=3, idle=()):
+    """Names left of a jump of the focal length, idle effects, and amounts of every image."""
+    rng = np.random.default_rng(seed)
+    effects = stepping(known, "sensor.focal", jump), *idle, hunting(hunts, rng)
+    current, fit = fitted(known, effects, rng)
     findings = [told(effect) for effect in current.scene.fitted_effects()]
-    fit = lambda scene: refitted(scene, weights)  # noqa: E731
-    left, kept = prune(current, findings, obs.pixel.size, fit)
+    left, kept = prune(current, findings, 2 * len(current.scene.recording.observations.epoch), fit)
     assert [f.effect.name for f in kept] == [e.name for e in left.scene.fitted_effects()]
     return [f.effect.name for f in kept]
 
 
 def test_a_course_stays_beside_amounts_that_could_follow_it(known):
-    assert pruned(known, jump=4e-3, hunting=2e-4) == ["jump", "hunts"]
+    assert pruned(known, jump=4e-3, hunts=2e-4) == ["jump", "hunts"]
 
 
 def test_what_comes_after_a_course_that_stays_goes_all_the_same(known):
     idle = Effect("idle", (Term("sensor.cx"),), "time", "linear", (), 0.0, CAMERA, (0.0,))
-    assert pruned(known, jump=4e-3, hunting=2e-4, idle=(idle,)) == ["jump", "hunts"]
+    assert pruned(known, jump=4e-3, hunts=2e-4, idle=(idle,)) == ["jump", "hunts"]
 
 
 def test_a_course_that_saves_the_amounts_nothing_goes(known):
     for seed in range(4):
-        assert pruned(known, jump=0.0, hunting=2e-3, seed=seed) == ["hunts"]
+        assert pruned(known, jump=0.0, hunts=2e-3, seed=seed) == ["hunts"]
 
 
 def test_amounts_follow_what_acts_at_their_ports_and_place():
@@ -106,8 +118,29 @@ def test_amounts_follow_what_acts_at_their_ports_and_place():
     jumps = replace(hunts, terms=each("epoch", "sensor.cx", "sensor.cy", numbers=range(N_EPOCHS)))
     turn, nearer = (replace(step, terms=(Term(p),)) for p in ("mount.turn_x", "mount.shift_z"))
     assert follows(jumps, turn) and not follows(jumps, nearer) and not follows(hunts, turn)
+    # What bends the rays of an image moves it, too.
+    shimmers = replace(hunts, terms=each("epoch", "medium.bend_u", numbers=range(N_EPOCHS)))
+    assert follows(shimmers, turn) and not follows(shimmers, nearer)
     findings = [told(step), told(hunts), told(shift)]
     assert [followed(findings, k) for k in range(3)] == [True, False, False]
+
+
+def test_amounts_hide_what_they_took_wherever_they_act(known):
+    """A camera that comes nearer magnifies; only the distances of the marks tell it apart."""
+    rng = np.random.default_rng(4)
+    nearer = stepping(known, "mount.shift_z", 4e-3)
+    alone, _ = fitted(known, (nearer,), rng)
+    (drop,) = lost_without(alone, [told(nearer)])
+    assert drop > 1e3
+    current, _ = fitted(known, (nearer, hunting(2e-3, rng)), rng)
+    step, hunts = (told(effect) for effect in current.scene.fitted_effects())
+    findings = [replace(step, drop=drop), hunts]
+    assert not followed(findings, 0) and hidden(current, findings, 0)
+    assert not hidden(alone, [replace(step, drop=drop)], 0)
+    # What was found beside the amounts is all there.
+    (left, _) = lost_without(current, findings)
+    assert not hidden(current, [replace(step, drop=left), hunts], 0)
+    assert not hidden(current, findings, 1)
 
 
 # --- what has no name ---------------------------------------------------------------------------

@@ -8,11 +8,17 @@ import pytest
 from networks import predicted
 
 from jaxvm.discover import diagnose
+from jaxvm.discover.diagnose import ROOM, _plain_fit
 from jaxvm.discover.heldout import hold_out, split
-from jaxvm.discover.scatter import ALIKE, likeness
+from jaxvm.discover.rivals import rivals
+from jaxvm.discover.scatter import ALIKE, likeness, of_each_image
+from jaxvm.discover.score import ScoreTests
+from jaxvm.discover.select import refit
+from jaxvm.discover.space import enumerate_hypotheses
 from jaxvm.discover.waves import strongest_wave
 from jaxvm.geometry.targets import grid_points
 from jaxvm.network.scene import build
+from jaxvm.network.start import start
 from jaxvm.physics.catalogue.entry import each
 from jaxvm.physics.effects import Effect, Scope
 from jaxvm.recording import Camera, Model, Observations, Recording, Station, Target
@@ -165,6 +171,23 @@ def test_an_image_that_jumps_is_named_at_its_camera(pair):
     assert finding.effect.scope.camera == ("other",)
     assert found.final.heldout_rms_px == pytest.approx(SIGMA, rel=0.05)
     assert found.likeness == 0.0
+
+
+def test_names_of_what_every_image_has_are_rivals_whoever_asks(pair):
+    """They are not among the hypotheses that are scored together, nor shown by a refit here."""
+    obs = pair.observations
+    jumps = 0.03 * np.random.default_rng(6).standard_normal((N_EPOCHS, 2))
+    recording = recorded(pair, jumps[obs.epoch] * (obs.camera == 1)[:, None])
+    parts, plain, _ = _plain_fit(start(build(recording, ())).with_effects((), ROOM), 3)
+    tests = ScoreTests.of(plain, enumerate_hypotheses(plain.scene))
+    leading, _ = of_each_image(plain.scene, tests, 1.0, parts.n, lambda *_: None)
+    here = [(h, a) for h, _, a in leading if h.scope.camera == ("other",)]
+    found = refit(plain, *next(own for own in here if own[0].entries[0].id == "image-jumps"), parts)
+    assert found is not None
+    own = found.hypothesis, found.effect
+    _, doubles = rivals(plain, found.adjustment, *own, tests, parts.n)
+    assert "haze" in {r.hypothesis.entries[0].id for r in doubles}
+    assert "focal-hunts" not in {r.hypothesis.entries[0].id for r in doubles}
 
 
 def test_what_every_camera_has_for_itself_is_told_and_not_claimed(pair):

@@ -12,7 +12,7 @@ import numpy as np
 from jaxvm.discover.diagnosis import Finding
 from jaxvm.discover.heldout import HeldOut, Split
 from jaxvm.discover.hypotheses import FREE
-from jaxvm.discover.revise import followed, given_effects, likelier, rename
+from jaxvm.discover.revise import given_effects, hidden, likelier, rename
 from jaxvm.discover.rivals import rivals
 from jaxvm.discover.score import ScoreTests
 from jaxvm.discover.select import shortlist
@@ -73,7 +73,7 @@ class Naming:
         was not near then is near now.
         """
         finding = findings[k]
-        if finding.hypothesis.entries or followed(findings, k):
+        if finding.hypothesis.entries or hidden(current, findings, k):
             return finding
         without = self._without(current, findings, k)
         variance = robust_variance(without)
@@ -108,7 +108,7 @@ class Naming:
         Beside amounts of every image that can follow it all names are alike: it keeps those it had.
         """
         finding = findings[k]
-        if followed(findings, k):
+        if hidden(current, findings, k):
             return finding
         without = self._without(current, findings, k)
         shown = [

@@ -30,8 +30,14 @@ _MOST_TRIED = 12
 """Alternatives that are fitted at most, those of the first findings first: what was named while
 most was missing is the likeliest to be wrong."""
 
-_MOVING = {"sensor.cx", "sensor.cy", "mount.turn_x", "mount.turn_y"}
+_MOVING = {
+    *("sensor.cx", "sensor.cy", "mount.turn_x", "mount.turn_y"),
+    *("medium.bend_u", "medium.bend_v", "medium.wedge_x", "medium.wedge_y"),
+}
 """Ports that move an image as a whole: amounts at some follow what happens at the others."""
+
+_HIDDEN = 0.5
+"""Share of its drop of chi-square below which a finding is hidden by amounts of every image."""
 
 _LIKELIER = 2.0
 """Odds from which a double leads in place of what fits best; less is within what odds are worth."""
@@ -97,6 +103,19 @@ def followed(findings: list[Finding], k: int) -> bool:
     return any(f is not findings[k] and follows(f.effect, findings[k].effect) for f in findings)
 
 
+def hidden(current: Adjustment, findings: list[Finding], k: int) -> bool:
+    """Whether what was found of the k-th is now taken for the most part by amounts of every image.
+
+    Also where these act elsewhere: at the only camera that sees its target, say. What is left of it
+    can no longer tell its name.
+    """
+    if followed(findings, k):
+        return True
+    if not any(f is not findings[k] and _has_amounts(f.effect) for f in findings):
+        return False
+    return lost_without(current, findings)[k] < _HIDDEN * findings[k].drop
+
+
 def rename(
     current: Adjustment, findings: list[Finding], n: int, fit: Fit
 ) -> tuple[Adjustment, list[Finding]]:
@@ -109,7 +128,7 @@ def rename(
     k, left = 0, _MOST_TRIED
     while len(findings) > 1 and k < len(findings):
         finding = findings[k]
-        if followed(findings, k):
+        if hidden(current, findings, k):
             k += 1
             continue
         heavier = [r.hypothesis for r in finding.rivals if r.weight > finding.weight]

@@ -14,6 +14,7 @@ import numpy as np
 from jaxvm.discover.courses import Course
 from jaxvm.discover.hypotheses import FREE, Family, Hypothesis
 from jaxvm.discover.ranking import Ranking
+from jaxvm.discover.scatter import families_of_images
 from jaxvm.discover.score import ScoreTests
 from jaxvm.discover.select import DECIDED, decisive_gap, log_prior, price_of_columns, stacked
 from jaxvm.discover.space import member
@@ -116,6 +117,9 @@ def rivals(
 
     scene, found = before.scene, []
     refined = _at(tests.battery.families, effect)
+    if any(term.driver == "epoch" for term in effect.terms):
+        # What every image has for itself is not among the hypotheses that are scored together.
+        refined = families_of_images(scene)
     asked = [tests, *([tests.about(refined)] if refined else [])]
     alike = [some.score(variance, residual=change) for some in asked]
     # What its own tangent does not explain (the way from one fit to the other is no straight line)
