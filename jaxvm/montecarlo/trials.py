@@ -83,7 +83,7 @@ class Traced(eqx.Module):
 
     def batch(self, key, numbers, mesh=None) -> Trial:
         if self.single:
-            # Accelerators multiply float32 as TF32 or bfloat16, of three digits, unless told not to.
+            # Accelerators multiply float32 in three digits (TF32, bfloat16) unless told not to.
             with jax.enable_x64(False), jax.default_matmul_precision("highest"):
                 return self._batch(key, numbers.astype(np.int32), mesh)
         return self._batch(key, numbers, mesh)
