@@ -3,12 +3,11 @@
     python benchmarks/accelerator/run.py [--quick] [--only WORK ...] [--out FOLDER] [--beside FILE]
 
 On a machine with an accelerator (and a jaxlib that knows it) the same work runs on it and on the
-processors of that machine: Monte Carlo of relay chains in float64 and of single poses in float64
-and in float32, adjustment of blocks of images, adjustment of a relay network in one program, the
-scoring of hypotheses. Each in a process of its own, warm, medians; compiling
-stands apart. What each found (costs, RMS errors) is compared. Without an accelerator the
-processors' column alone is filled, beside the other column of an earlier run where one is given.
-Writes results.json, results.md and results.png.
+processors of that machine: Monte Carlo of relay chains and of single poses in float64 and float32,
+adjustment of blocks of images, adjustment of a relay network in one program, scoring of hypotheses.
+Each in a process of its own, warm, medians; compiling stands apart. What each found (costs, RMS
+errors) is compared. Without an accelerator the processors' column alone is filled, beside the other
+column of an earlier run where one is given. Writes results.json, results.md and results.png.
 """
 
 import argparse
@@ -23,20 +22,24 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 from matplotlib.figure import Figure
 
 HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parent))
+import results  # noqa: E402
 
 ROUNDS = 3
 
 SETTLED = 1e-2
-"""Change of an unknown, in the unit that its observations give it, at which float32 is settled."""
+"""Change of an unknown, in the unit that its observations give it, at which float32 is settled (as
+in `../monte_carlo/devices.py`)."""
 
 
-def of(folder: str, file: str):
+def of(folder: str, file: str) -> Any:
     """A module of another benchmark: many are called run.py."""
     spec = importlib.util.spec_from_file_location(f"{folder}_{file}", HERE.parent / folder / file)
     assert spec is not None and spec.loader is not None
@@ -136,7 +139,6 @@ def scoring(epochs: int, hypotheses: int) -> dict:
         "first_s": row["first_s"],
         "seconds": row["seconds"],
         "residuals": found["residuals"],
-        "found": [float(row["hypotheses"])],
         "refit_s": found["refit_s"],
     }
 
@@ -236,12 +238,13 @@ def draw(found: dict) -> Figure:
     figure = Figure(figsize=(8, 4), layout="constrained")
     axis = figure.subplots()
     rows = found["rows"][::-1]
-    for k, side in enumerate(("processors", "accelerator")):
+    names = {"processors": f"{found['processors']} processors", "accelerator": found["accelerator"]}
+    for k, side in enumerate(names):
         seconds = [row[side].get("seconds", np.nan) for row in rows]
-        axis.barh(np.arange(len(rows)) + 0.4 * k, seconds, 0.4, label=side)
+        axis.barh(np.arange(len(rows)) + 0.4 * k, seconds, 0.4, label=names[side])
     axis.set_yticks(np.arange(len(rows)) + 0.2, [row["what"] for row in rows])
     axis.set(xscale="log", xlabel="seconds, warm")
-    axis.legend()
+    figure.legend(loc="outside lower center", ncols=2)
     return figure
 
 
@@ -287,15 +290,9 @@ def main() -> None:
             print(json.dumps({name: {side: own}}), flush=True)
             if not options.quick:
                 # What is done so far stays if the machine is taken away.
-                write(options.out, found)
-    print(table(found))
-
-
-def write(folder: Path, found: dict) -> None:
-    """The results so far."""
-    (folder / "results.json").write_text(json.dumps(found, indent=1) + "\n")
-    (folder / "results.md").write_text(table(found))
-    draw(found).savefig(folder / "results.png", dpi=120)
+                results.write(options.out, found, table(found), draw(found))
+    if options.quick:
+        print(table(found))
 
 
 if __name__ == "__main__":

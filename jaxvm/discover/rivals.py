@@ -116,11 +116,11 @@ def rivals(
                 claim.of_driver[driver] = odds, named
 
     scene, found = before.scene, []
-    refined = _at(tests.battery.families, effect)
-    if any(term.driver == "epoch" for term in effect.terms):
-        # What every image has for itself is not among the hypotheses that are scored together.
-        refined = families_of_images(scene)
-    asked = [tests, *([tests.about(refined)] if refined else [])]
+    # Neither is among the hypotheses that are scored together: what every image has for itself, and
+    # constants between those of the grid.
+    of_images = any(term.driver == "epoch" for term in effect.terms)
+    further = families_of_images(scene) if of_images else _at(tests.battery.families, effect)
+    asked = [tests, *([tests.about(further)] if further else [])]
     alike = [some.score(variance, residual=change) for some in asked]
     # What its own tangent does not explain (the way from one fit to the other is no straight line)
     # speaks against no other hypothesis either.
