@@ -56,6 +56,14 @@ def _check_out(options: argparse.Namespace) -> None:
             raise OSError(f"--out {problem}") from None
 
 
+def _interrupt() -> None:
+    """Ctrl-C for the main thread; by a signal where there are any, which ends a wait as well."""
+    if hasattr(signal, "pthread_kill"):
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+    else:
+        _thread.interrupt_main()
+
+
 class Interruption:
     """Ctrl-C, remembered and repeated: what arrives in a callback of a library is lost there."""
 
@@ -86,7 +94,7 @@ class Interruption:
         """Interrupt again, soon, what could not be interrupted, such as a garbage collection."""
         if unraisable.exc_type is not KeyboardInterrupt:
             return self._told(unraisable)
-        self._again = threading.Timer(0.05, _thread.interrupt_main)
+        self._again = threading.Timer(0.05, _interrupt)
         self._again.daemon = True
         self._again.start()
 
