@@ -49,10 +49,11 @@ class Signal:
     Attributes:
         cameras: numbers of the cameras that show it.
         ratio: for each camera of the model, variance of the signal over that of the noise.
-        length_px: distance of marks (px) over which the covariance falls to 1/e.
+        length_px: distance of marks (px) over which the covariance falls to 1/e; infinite where
+            images move as a whole.
         size_rad: its standard deviation as a tilt of the rays, for each of these cameras.
         size_stds_rad: standard deviations of these, from the scatter among images.
-        length_rad: the distance as an angle, of the first camera that shows it.
+        length_rad: the distance as an angle, of the first camera that shows it; or infinite.
         lasting: share that the next epoch still has.
         p_value: that neighbours which share nothing are so much alike.
         drop: of chi-square in the fitted epochs, by the stated sigmas.
@@ -75,14 +76,19 @@ class Signal:
     gain: Gain
     heldout: HeldOut
 
+    @property
+    def whole(self) -> bool:
+        """Whether images move as a whole: what each stabiliser does, too."""
+        return not np.isfinite(self.length_px)
+
 
 def collocate(fitted: Adjustment, heldout: HeldOut, parts: Split, seed: int = 0) -> Signal | None:
     """The signal that neighbouring marks share at random, if held-out epochs prove it.
 
     None where neighbours are hardly alike; where what they share lasts from one epoch to the next,
-    which a deformation does that is not modelled; where whole images move, which a mount or a
-    stabiliser does; and where fewer than two cameras show it: what one has for itself is no signal
-    of the air.
+    which a deformation does that is not modelled; and where fewer than two cameras show it: what
+    one has for itself is no signal of the air, and has an amount for every image. It falls off with
+    distance where that foretells clearly better than images that move as a whole.
 
     Args:
         fitted: the last fit, to the fitted epochs.
@@ -99,8 +105,9 @@ def collocate(fitted: Adjustment, heldout: HeldOut, parts: Split, seed: int = 0)
     common, length = _covariance(marks, _lengths(marks))
     shown = _Shown.of(marks, np.full(n_cameras, common), length)
     whole, far = _covariance(marks, np.array([_WHOLE]))
-    if not shown.better(_Shown.of(marks, np.full(n_cameras, whole), far), scene):
-        return None
+    as_a_whole = _Shown.of(marks, np.full(n_cameras, whole), far)
+    if not shown.better(as_a_whole, scene):
+        shown, length = as_a_whole, far
     variances, stds = shown.variances(scene)
     cameras = tuple(np.flatnonzero(variances > _SURE * stds).tolist())
     if len(cameras) < 2 or abs(shown.lasting(scene, cameras)) > LASTING:
@@ -112,16 +119,17 @@ def collocate(fitted: Adjustment, heldout: HeldOut, parts: Split, seed: int = 0)
     left = marks.error - _Shown.of(marks, ratio, length).foretold
     after = _on_heldout(heldout, parts, ratio, length)
     proof = gain(heldout, after, seed)
+    reach = np.inf if length == _WHOLE else length
     focal = np.asarray(scene.state.focal).mean(axis=1)[[*cameras]]
     sizes = np.sqrt(variances[[*cameras]])
     unit = reference_sigma(scene) / focal
     found = Signal(
         cameras=cameras,
         ratio=ratio,
-        length_px=length,
+        length_px=reach,
         size_rad=sizes * unit,
         size_stds_rad=0.5 * stds[[*cameras]] / sizes * unit,
-        length_rad=float(length / focal[0]),
+        length_rad=float(reach / focal[0]),
         lasting=shown.lasting(scene, cameras),
         p_value=float(min(n_cameras * norm.sf((variances / stds)[[*cameras]].max()), 1.0)),
         drop=float(np.sum(marks.error**2) - np.sum(left**2)),

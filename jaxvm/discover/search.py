@@ -115,14 +115,16 @@ class Search:
             if self.p_value <= self.alpha:
                 leading = with_jumps(leading, self._tests, self.ranking, self.parts.n)
             accepted = self._accepted(leading, progress)
-            if accepted is None:
-                # What no course explains may be a wave, or differ from image to image.
-                scored = self.p_value
-                leading, self.p_value = self._unscored()
-                accepted = self._accepted(leading, progress)
+            scored = self.p_value
+            # What no course explains may be a wave, or differ from image to image.
+            for others in (self._waves, self._images):
                 if accepted is None:
-                    self.p_value = min(scored, self.p_value)
-                    break
+                    leading, self.p_value = others()
+                    accepted = self._accepted(leading, progress)
+                    scored = min(scored, self.p_value)
+            if accepted is None:
+                self.p_value = scored
+                break
             self.unproven = ""
             effect, before = accepted.chosen.effect, len(self.findings)
             self._take(accepted, leading)
@@ -168,22 +170,27 @@ class Search:
             return None
         return found
 
-    def _unscored(self):
-        """What is not among the hypotheses that are scored together, as `_score` gives them.
+    def _waves(self):
+        """The strongest wave over an image, and its p-value; it is not among what is scored."""
+        current = self.current
+        wave, p, drop = strongest_wave(current.scene, self.parts.residuals(current), self.seed)
+        evidence = drop / robust_variance(current)
+        return self._hopeful([(wave, evidence, np.zeros(wave.n_columns))], p)
 
-        A wave over an image, or what every image has for itself; and the p-value.
-        """
-        current, variance = self.current, robust_variance(self.current)
-        residual = self.parts.residuals(current)
-        wave, p, drop = strongest_wave(current.scene, residual, self.seed)
-        columns = np.zeros(wave.n_columns)
-        leading = [(wave, drop / variance, columns)]
-        alike = likeness(current.scene, residual)
+    def _images(self):
+        """What every image has for itself, and its p-value; it is not among what is scored."""
+        current = self.current
+        alike = likeness(current.scene, self.parts.residuals(current))
         # Where neighbours are only a little alike, it may be noise that they share.
-        if p > self.alpha and (alike > ALIKE or alike == 0.0):
-            leading, p = of_each_image(
-                current.scene, self._tests, variance, self.parts.n, self._left_by
-            )
+        if 0.0 < alike <= ALIKE:
+            return [], 1.0
+        variance = robust_variance(current)
+        return self._hopeful(
+            *of_each_image(current.scene, self._tests, variance, self.parts.n, self._left_by)
+        )
+
+    def _hopeful(self, leading, p: float):
+        """What has not failed yet, and the p-value of the first."""
         hopeful = [
             item for item in leading if (identity(item[0]), item[0].course) not in self._hopeless
         ]

@@ -16,6 +16,7 @@ from jaxvm.report.words import (
     explanation,
     parameters,
     separate_by,
+    signal_names,
     signal_parameters,
     when,
 )
@@ -119,6 +120,7 @@ def _finding(finding: Finding) -> dict[str, Any]:
 def _signal(signal: Signal, diagnosis: Diagnosis) -> dict[str, Any]:
     """What the marks of an image share at random, with the keys of a finding."""
     values, gain = _parameters(signal_parameters(signal, diagnosis)), signal.gain
+    names = signal_names(signal)
     return {
         "physics": HAZE.physics,
         "catalogue_id": HAZE.id,
@@ -139,11 +141,24 @@ def _signal(signal: Signal, diagnosis: Diagnosis) -> dict[str, Any]:
         "share_of_excess": diagnosis.signal_share,
         "p_value": signal.p_value,
         "n_hypotheses": 1,
-        "weight": 1.0,
+        "weight": 1.0 / len(names),
         "other_drivers": [],
-        "equivalents": [],
+        "equivalents": [
+            {
+                "physics": entry.physics,
+                "catalogue_id": entry.id,
+                "rows": list(entry.rows),
+                "port": entry.groups[0][0].port,
+                "driver": "image",
+                "form": "random",
+                "where": {},
+                "weight": 1.0 / len(names),
+                "other_drivers": [],
+            }
+            for entry in names[1:]
+        ],
         "nearly_as_good": [],
-        "separate_by": HAZE.separate_by,
+        "separate_by": "; ".join(entry.separate_by for entry in names),
         "advice": [],
         "shared": "",
         "explanation": HAZE.explanation,

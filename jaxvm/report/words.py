@@ -13,7 +13,7 @@ from jaxvm.discover.scatter import ALIKE
 from jaxvm.discover.shape import shape_words
 from jaxvm.identify.inputs import are_power
 from jaxvm.identify.model import CameraDrift
-from jaxvm.physics.catalogue import BY_ID
+from jaxvm.physics.catalogue import BY_ID, Entry
 from jaxvm.physics.drivers import channel_unit
 from jaxvm.physics.effects import Effect
 from jaxvm.physics.forms import FORMS
@@ -25,8 +25,8 @@ _HOPELESS = 0.05
 
 _PORT = {port.name: port for port in PORTS}
 
-HAZE = BY_ID["haze"]
-"""What a random signal that the marks of an image share is called."""
+HAZE, STABILISER = BY_ID["haze"], BY_ID["image-jumps"]
+"""What a random signal that the marks of an image share is called; and, of whole images, too."""
 
 SIGNAL_WHEN = "in every image anew, alike for neighbouring marks"
 
@@ -268,6 +268,11 @@ def proof(gain: Gain) -> str:
     return words
 
 
+def signal_names(signal: Signal) -> list[Entry]:
+    """What a random signal that the marks of an image share may be, the air first."""
+    return [HAZE, STABILISER] if signal.whole else [HAZE]
+
+
 def signal_parameters(signal: Signal, diagnosis: Diagnosis) -> list[Parameter]:
     """Numbers of what the marks of an image share at random."""
     cameras = diagnosis.recording.model.cameras
@@ -277,7 +282,7 @@ def signal_parameters(signal: Signal, diagnosis: Diagnosis) -> list[Parameter]:
             Parameter(f"tilt of the rays, {cameras[c].name}", float(value), float(std), "rad")
             for c, value, std in sizes
         ),
-        Parameter("correlation length", signal.length_rad, 0.0, "rad"),
+        *([] if signal.whole else [Parameter("correlation length", signal.length_rad, 0.0, "rad")]),
     ]
 
 
@@ -290,6 +295,7 @@ def signal_rows(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     sizes = "; ".join(f"{p.name} {quantity(p.value, p.std, p.unit)}" for p in values)
     return [
         ("where", "everywhere; seen by the cameras that are named with their sizes"),
+        *([("or", f"{STABILISER.physics}, at each of them")] if signal.whole else []),
         ("when", SIGNAL_WHEN),
         ("size", f"{sizes} (standard deviations of single images)"),
         (
@@ -299,7 +305,7 @@ def signal_rows(diagnosis: Diagnosis) -> list[tuple[str, str]]:
             f"image {signal.lasting:.2f}",
         ),
         ("proof", proof(gain)),
-        ("separate", HAZE.separate_by),
+        ("separate", "; ".join(entry.separate_by for entry in signal_names(signal))),
     ]
 
 
