@@ -96,3 +96,28 @@ def test_what_no_hypothesis_explains_of_the_change_speaks_against_none(warmed, m
     still, weight = asked()
     assert still.keys() == others.keys()
     assert weight == pytest.approx(own, abs=0.1)
+
+
+def test_a_rival_pays_no_more_for_its_instant_than_the_finding(warmed):
+    """Its grid is the same, also where the finding's own instant lies between two of the grid."""
+    recording, _, reach = warmed
+    obs, n = recording.observations, len(recording.time)
+    late = (obs.epoch >= n // 2)[:, None] & (reach != 0.0).any(axis=1, keepdims=True)
+    pixel = obs.pixel + late * [0.1, 0.0]
+    moved = replace(recording, observations=replace(obs, pixel=pixel))
+    scene = start(build(moved, ())).with_effects(moved.model.effects, ROOM)
+    parts, plain, _ = _plain_fit(scene, 3)
+    tests = ScoreTests.of(plain, enumerate_hypotheses(plain.scene))
+
+    def is_step(hypothesis: Hypothesis, port: str) -> bool:
+        ports = [term.port for term in hypothesis.group.terms]
+        return ports == [port] and hypothesis.course.form == "step"
+
+    leading = top(tests.score(1.0), plain.scene, 10_000, 1)
+    jump, _, amplitudes = next(item for item in leading if is_step(item[0], "sensor.cx"))
+    found = refit(plain, jump, amplitudes, parts)
+    assert found is not None
+    own = found.hypothesis, found.effect
+    chief, others = rivals(plain, found.adjustment, *own, tests, parts.n)
+    (turn,) = [r for r in others if is_step(r.hypothesis, "mount.turn_y")]
+    assert turn.weight > 0.3 * chief.weight * np.exp(-0.5 * turn.gap)

@@ -128,8 +128,9 @@ def rivals(
     full = float(np.clip(explained, _LEAST * full, full)) if explained > 0.0 else full
     for ranking in alike:
         found += list(_resembling(ranking, scene, own, full, variance, limit + saved))
-    own_price = min((price for h, _, price, _ in found if h.same(own)), default=0.0)
+    # The first ranking is over the grid; at the constants of the effect alone nothing has a price.
     prices = {_course_of(h): price for h, _, price, _ in reversed(found)}
+    own_price = prices.get(_course_of(own), 0.0)
     for hypothesis, gap, _, amplitudes in found:
         columns = price_of_columns(hypothesis, amplitudes, full - gap, n) - own_columns
         if gap + min(columns, 0.0) <= limit:
