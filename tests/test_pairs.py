@@ -15,6 +15,7 @@ from jaxvm.discover.select import refit, shortlist
 from jaxvm.discover.space import enumerate_hypotheses
 from jaxvm.network.scene import build
 from jaxvm.network.start import start
+from jaxvm.physics.forms import JUMPS
 from jaxvm.solve.snooping import robust_variance
 
 PER_KELVIN = 2e-5
@@ -68,8 +69,8 @@ def test_a_wide_name_gives_way_to_two_narrow_ones(two):
 
 
 def test_a_narrow_name_alone_needs_no_second_thought():
-    def of(columns, *names):
-        effect = SimpleNamespace(amplitudes=(0.0,) * columns)
+    def of(columns, *names, form="linear"):
+        effect = SimpleNamespace(amplitudes=(0.0,) * columns, form=form)
         return SimpleNamespace(effect=effect, hypothesis=SimpleNamespace(entries=names))
 
     assert not worth_a_second_thought([])
@@ -78,4 +79,5 @@ def test_a_narrow_name_alone_needs_no_second_thought():
     assert worth_a_second_thought([of(6, "wide")])
     assert worth_a_second_thought([of(1)])
     assert not worth_a_second_thought([of(24), of(1, "one")])
+    assert worth_a_second_thought([of(9, "jumping", form=JUMPS[3])])
     assert not worth_a_second_thought([of(1, "one")] * 5)

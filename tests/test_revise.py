@@ -169,8 +169,13 @@ def test_names_at_its_place_are_tried_for_what_has_none(drifting):
     assert all(h.entries and h.scope == before.hypothesis.scope for h in tried)
     # What settles slowly after power-on is nearly a straight line.
     assert "focal-warm-up" in {entry.id for h in tried for entry in h.entries}
+    # Of what has a name the others are tried, at any place.
     named = replace(before, hypothesis=tried[0])
-    assert naming.with_names_to_try(fit, [named], 0) is named
+    again = naming.with_names_to_try(fit, [named], 0).alternatives
+    own = {(h.entries[0].id, h.scope) for h in again}
+    assert 0 < len(again) == len(own) <= 3
+    assert (tried[0].entries[0].id, tried[0].scope) not in own
+    assert "focal-jump" in {entry.id for h in again for entry in h.entries}
 
 
 @pytest.mark.parametrize("weight, leads", [(0.9, False), (1.1, True)])

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxvm.discover.diagnosis import Finding
 from jaxvm.discover.heldout import HeldOut, Split
-from jaxvm.discover.hypotheses import FREE
+from jaxvm.discover.hypotheses import FREE, Hypothesis
 from jaxvm.discover.revise import given_effects, hidden, likelier, rename
 from jaxvm.discover.rivals import rivals
 from jaxvm.discover.score import ScoreTests
@@ -26,10 +26,18 @@ _WIDER = 1.2
 """Inflation by noise from which the rivals of a finding are weighed again: more of them stay."""
 
 _LEADING, _NAMES = 60, 3
-"""Leading hypotheses among which names are looked for, and names tried for what has none."""
+"""Leading hypotheses among which names are looked for, and names tried for each finding."""
+
+_BEHIND = 10.0
+"""Foretold evidence by which another name may fall behind and still be tried: fits are curved."""
 
 Named = tuple[Adjustment, list[Finding]]
 """A fit and the findings that are the last of its effects."""
+
+
+def _name(hypothesis: Hypothesis) -> tuple:
+    """The first name and the place of a hypothesis."""
+    return hypothesis.entries[0].id, hypothesis.scope
 
 
 @dataclass(frozen=True)
@@ -67,19 +75,30 @@ class Naming:
         return named
 
     def with_names_to_try(self, current: Adjustment, findings: list[Finding], k: int) -> Finding:
-        """A finding without a name, with the named ones that lead at its place beside the others.
+        """A finding with the names that lead in its place beside the others.
 
-        While others were missing, a stranger's sensor and a play of its own may have led, and what
-        was not near then is near now.
+        While others were missing, what takes a part of both may have led, or a stranger's sensor
+        and a play of its own. Rivals are known by what the finding explains; here counts what the
+        data have in its place. For what has no name, names are looked for at its own place.
         """
         finding = findings[k]
-        if finding.hypothesis.entries or hidden(current, findings, k):
+        if hidden(current, findings, k):
             return finding
         without = self._without(current, findings, k)
         variance = robust_variance(without)
         ranking = self.tests.at(without).score(variance)
         leading = shortlist(ranking, current.scene, variance, self.parts.n, _LEADING, FREE)
-        named = [h for h, *_ in leading if h.entries and h.scope == finding.hypothesis.scope]
+        own = finding.hypothesis
+        least = next((e for h, e, _ in leading if h.same(own)), -np.inf) - _BEHIND
+        if not own.entries:
+            named = [h for h, *_ in leading if h.entries and h.scope == own.scope]
+        else:
+            known = {_name(own)}
+            named = [
+                h
+                for h, evidence, _ in leading
+                if h.entries and evidence > least and not (_name(h) in known or known.add(_name(h)))
+            ]
         return replace(finding, alternatives=(*named[:_NAMES], *finding.alternatives))
 
     def _renamed(self, current: Adjustment, findings: list[Finding]) -> Named:

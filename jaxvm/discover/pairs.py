@@ -14,6 +14,7 @@ from jaxvm.discover.ranking import Ranking
 from jaxvm.discover.revise import complexity
 from jaxvm.discover.score import ScoreTests
 from jaxvm.discover.select import DECIDED, Candidate, price, refit, shortlist, spread_of
+from jaxvm.physics.forms import JUMPS
 from jaxvm.solve.adjust import Adjustment
 from jaxvm.solve.snooping import robust_variance
 
@@ -34,11 +35,14 @@ _HOPEFUL = 0.6
 def worth_a_second_thought(findings: list[Finding]) -> bool:
     """Whether findings may be a pair of others: a few, or one that is wide or has no name.
 
-    Not after a free form, and where there are many no pair will do.
+    Not after a free form (what jumps several times is none), and where there are many no pair will
+    do.
     """
-    if not 0 < len(findings) <= MANY or len(findings[0].effect.amplitudes) > FREE:
+    if not 0 < len(findings) <= MANY:
         return False
     first = findings[0]
+    if len(first.effect.amplitudes) > FREE and first.effect.form not in JUMPS.values():
+        return False
     doubtful = len(first.effect.amplitudes) >= WIDE or not first.hypothesis.entries
     return len(findings) > 1 or doubtful
 
