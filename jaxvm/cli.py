@@ -58,8 +58,9 @@ def _check_out(options: argparse.Namespace) -> None:
 
 def _interrupt() -> None:
     """Ctrl-C for the main thread; by a signal where there are any, which ends a wait as well."""
-    if hasattr(signal, "pthread_kill"):
-        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+    main_thread = threading.main_thread().ident
+    if main_thread is not None and hasattr(signal, "pthread_kill"):
+        signal.pthread_kill(main_thread, signal.SIGINT)
     else:
         _thread.interrupt_main()
 

@@ -169,7 +169,11 @@ def test_names_at_its_place_are_tried_for_what_has_none(drifting):
     assert all(h.entries and h.scope == before.hypothesis.scope for h in tried)
     # What settles slowly after power-on is nearly a straight line.
     assert "focal-warm-up" in {entry.id for h in tried for entry in h.entries}
-    # Of what has a name the others are tried, at any place.
+
+
+def test_other_names_are_tried_for_what_has_one(drifting):
+    naming, fit, before = drifting
+    tried = naming.with_names_to_try(fit, [before], 0).alternatives
     named = replace(before, hypothesis=tried[0])
     again = naming.with_names_to_try(fit, [named], 0).alternatives
     own = {(h.entries[0].id, h.scope) for h in again}

@@ -11,9 +11,9 @@ import numpy as np
 
 from jaxvm.discover.diagnosis import Finding
 from jaxvm.discover.heldout import HeldOut, Split
-from jaxvm.discover.hypotheses import FREE, Hypothesis
+from jaxvm.discover.hypotheses import FREE
 from jaxvm.discover.revise import given_effects, hidden, likelier, rename
-from jaxvm.discover.rivals import rivals
+from jaxvm.discover.rivals import claim_of, rivals
 from jaxvm.discover.score import ScoreTests
 from jaxvm.discover.select import shortlist
 from jaxvm.solve.adjust import Adjustment
@@ -33,11 +33,6 @@ _BEHIND = 10.0
 
 Named = tuple[Adjustment, list[Finding]]
 """A fit and the findings that are the last of its effects."""
-
-
-def _name(hypothesis: Hypothesis) -> tuple:
-    """The first name and the place of a hypothesis."""
-    return hypothesis.entries[0].id, hypothesis.scope
 
 
 @dataclass(frozen=True)
@@ -90,15 +85,14 @@ class Naming:
         leading = shortlist(ranking, current.scene, variance, self.parts.n, _LEADING, FREE)
         own = finding.hypothesis
         least = next((e for h, e, _ in leading if h.same(own)), -np.inf) - _BEHIND
-        if not own.entries:
-            named = [h for h, *_ in leading if h.entries and h.scope == own.scope]
+        if own.entries:
+            first = {claim_of(own): own}
+            for hypothesis, evidence, _ in leading:
+                if hypothesis.entries and evidence > least:
+                    first.setdefault(claim_of(hypothesis), hypothesis)
+            _, *named = first.values()
         else:
-            known = {_name(own)}
-            named = [
-                h
-                for h, evidence, _ in leading
-                if h.entries and evidence > least and not (_name(h) in known or known.add(_name(h)))
-            ]
+            named = [h for h, *_ in leading if h.entries and h.scope == own.scope]
         return replace(finding, alternatives=(*named[:_NAMES], *finding.alternatives))
 
     def _renamed(self, current: Adjustment, findings: list[Finding]) -> Named:

@@ -107,7 +107,7 @@ def rivals(
         names = tuple(entry.id for entry in hypothesis.entries)
         for named in _one_by_one(hypothesis):
             odds = float(fit + log_prior(named, np.asarray(amplitudes)) - own_prior)
-            claim = claims.setdefault(_claim_of(named), _Claim(named, names, gap, -np.inf))
+            claim = claims.setdefault(claim_of(named), _Claim(named, names, gap, -np.inf))
             if odds > claim.log_odds:
                 claim.hypothesis, claim.names = named, names
                 claim.gap, claim.log_odds = gap, odds
@@ -146,10 +146,10 @@ def rivals(
 
     total = np.logaddexp.reduce([claim.weight for claim in claims.values()])
     weights = {key: float(np.exp(claim.weight - total)) for key, claim in claims.items()}
-    mine = claims.pop(_claim_of(own))
+    mine = claims.pop(claim_of(own))
     least = max(weights.values()) / _ODDS
     kept = [_rival(claim, weights[key]) for key, claim in claims.items() if weights[key] >= least]
-    chief = replace(_rival(mine, weights[_claim_of(own)], own.course.driver), hypothesis=own)
+    chief = replace(_rival(mine, weights[claim_of(own)], own.course.driver), hypothesis=own)
     return chief, _foremost(sorted(kept, key=lambda r: -r.weight))
 
 
@@ -158,7 +158,7 @@ def _foremost(ordered: list[Rival]) -> list[Rival]:
     places: dict[tuple, int] = {}
     kept = []
     for rival in ordered:
-        name, _ = _claim_of(rival.hypothesis)
+        name, _ = claim_of(rival.hypothesis)
         if name in places or len(places) < MOST:
             places[name] = places.get(name, 0) + 1
             kept += [rival] if places[name] <= PLACES else []
@@ -173,7 +173,7 @@ def _rival(claim: _Claim, weight: float, driver: str = "") -> Rival:
     return Rival(claim.hypothesis, claim.gap, weight, tuple(near), claim.names)
 
 
-def _claim_of(hypothesis: Hypothesis) -> tuple:
+def claim_of(hypothesis: Hypothesis) -> tuple:
     """What is claimed, whatever drives it: a name, or the terms where there is none; the place."""
     names = tuple(entry.id for entry in hypothesis.entries[:1]) or hypothesis.group.terms
     return names, hypothesis.scope
