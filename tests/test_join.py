@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from networks import Known, at_values, stereo_recording
 
-from jaxvm.discover.courses import enumerate_courses
+from jaxvm.discover.courses import enumerate_courses, longest_session
 from jaxvm.network.scene import build
 from jaxvm.physics.drivers import SESSION, build_channels
 from jaxvm.recording import (
@@ -151,6 +151,21 @@ def test_epochs_read_the_time_since_their_own_session(pair):
     np.testing.assert_allclose(
         channel(scene, "time since the session's start"), expected, atol=1e-6
     )
+
+
+@pytest.mark.parametrize("beyond", [-3e-7, 0.0, 3e-7])
+def test_a_session_begins_with_its_first_epoch_whatever_the_clocks_last_digits(beyond):
+    """The grid of the channels is round, the clock need not be."""
+    pause, spacing = 86_400.0, 30.0
+    own = spacing * np.arange(5)
+    start = own[-1] + pause + beyond
+    time = np.concatenate([own, start + own])
+    channels = build_channels(time, {}, None, {"left": (0.0, start)}, starts=time[[0, 5]])
+    for name in (SESSION, "time since power-on of left"):
+        row = channels.values[channels.index(name)]
+        read = np.interp(channels.epoch_time, channels.time, row)
+        np.testing.assert_allclose(read, np.concatenate([own, own]), atol=2e-3)
+    assert longest_session(channels) == pytest.approx(own[-1], abs=2e-3)
 
 
 def test_time_since_power_on_restarts_at_each_moment():

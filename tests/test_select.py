@@ -127,6 +127,26 @@ def test_what_settles_between_two_epochs_is_a_step(pauses, sound):
     assert sensible(scene, slow) == sound
 
 
+@pytest.mark.parametrize("share, sound", [(0.1, True), (0.95, False), (1.5, False)])
+def test_what_stands_still_for_its_dead_time_is_a_constant(share, sound):
+    scene = board_recording().true_scene()
+    channels = scene.network.channels
+    values = np.asarray(channels.values[channels.index("time")])
+    late = Effect(
+        "it follows late",
+        (Term("target.scale"),),
+        driver="time",
+        form="delay",
+        constants=(share * float(np.ptp(channels.epoch_time)),),
+        reference=float(values.mean()),
+        scope=Scope(target=("board",)),
+        amplitudes=(1e-5,),
+    )
+    assert sensible(scene, late) == sound
+    # Nothing is known of the course while it has no size.
+    assert sensible(scene, replace(late, amplitudes=(0.0,)))
+
+
 def test_depths_of_marks_do_not_run_away_with_the_poses():
     """Depths that rise across the board are the board's pose: none of that is in what is found."""
     known = board_recording(n_epochs=12)

@@ -3,12 +3,16 @@
 from collections.abc import Iterator
 from dataclasses import replace
 
+import jax.numpy as jnp
 import numpy as np
 
-from jaxvm.discover.courses import at_epochs
+from jaxvm.discover.courses import at_epochs, longest_session
 from jaxvm.network.scene import Scene
-from jaxvm.physics.effects import Effect
+from jaxvm.physics.effects import Effect, courses, room_for, tabulate
 from jaxvm.physics.forms import FORMS
+
+_STILL = 0.25
+"""Share of its size by which a course must change, or it is as good as constant."""
 
 
 def constants_held(scene: Scene, since: int = 0) -> np.ndarray:
@@ -29,10 +33,13 @@ def run_away(before: Scene, after: Scene) -> bool:
 def sensible(scene: Scene, effect: Effect) -> bool:
     """Whether refined constants stayed positive and within reach of the recording.
 
-    What settles faster than epochs follow each other is a step, and can't be told from it.
+    What settles faster than epochs follow each other is a step, and can't be told from it. What
+    hardly changes any more (after a dead time as long as the recording, say) has become a constant
+    under another name.
     """
-    time = np.asarray(scene.network.channels.epoch_time)
-    span = float(np.ptp(time)) or 1.0
+    channels = scene.network.channels
+    time = np.asarray(channels.epoch_time)
+    span = longest_session(channels) or 1.0
     if effect.form == "settling" and effect.constants[1] < np.median(np.diff(time)):
         return False
     for constant, value in zip(FORMS[effect.form].constants, effect.constants, strict=True):
@@ -40,7 +47,18 @@ def sensible(scene: Scene, effect: Effect) -> bool:
             return False
         if constant.unit == "s" and value > 3.0 * span:
             return False
-    return True
+    return not effect.constants or _changes(scene, effect)
+
+
+def _changes(scene: Scene, effect: Effect) -> bool:
+    """Whether any term of an effect changes over the views, for its size."""
+    channels = scene.network.channels
+    room = room_for((effect,), scene.room)
+    table, amplitude, constant = tabulate((effect,), channels, *room)
+    each = amplitude[:, None] * np.asarray(courses(table, jnp.asarray(constant), channels))
+    terms = each[: effect.n_columns].reshape(len(effect.terms), -1, each.shape[1]).sum(axis=1)
+    sizes = np.abs(terms).max(axis=1)
+    return not sizes.any() or bool((np.ptp(terms, axis=1) > _STILL * sizes)[sizes > 0.0].any())
 
 
 def jumps_of(scene: Scene) -> list[tuple[int, int]]:

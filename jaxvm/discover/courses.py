@@ -100,7 +100,7 @@ def enumerate_courses(scene: Scene) -> list[Course]:
     courses = [Course("constant", "constant")]
     if len(channels.epoch_time) < _FEWEST_EPOCHS:
         return courses
-    span = _span(channels)
+    span = longest_session(channels)
     lags = np.geomspace(max(2 * _spacing(channels), span / 200), span / 3, 6).tolist()
     for driver, kind in zip(channels.names, channels.kinds, strict=True):
         if kind in _OF_KIND:
@@ -132,7 +132,7 @@ def _of_quantity(driver: str, channels: Channels, lags: list[float]) -> list[Cou
     width = float(np.ptp(values))
     if width == 0.0:
         return []
-    reference, span = _reference(driver, channels), _span(channels)
+    reference, span = _reference(driver, channels), longest_session(channels)
     hours = np.asarray(channels.epoch_time) / 3600.0
     rate = float(np.median(np.abs(np.gradient(values, hours))))
     return [
@@ -223,7 +223,7 @@ def _warming_up(driver: str, lags: list[float]) -> list[Course]:
 
 def _of_time(driver: str, channels: Channels, lags: list[float]) -> list[Course]:
     """Time: trends, steps between epochs, ramps, a comb of periods, what settles after an event."""
-    span = _span(channels)
+    span = longest_session(channels)
     since = np.unique(at_epochs(driver, channels))
     instants = gaps(driver, channels)
     if len(instants) > _MOST_INSTANTS:
@@ -297,8 +297,8 @@ def _reference(driver: str, channels: Channels) -> float:
     return float(np.mean(values))
 
 
-def _span(channels: Channels) -> float:
-    """Length of the longest session (s): no lag or period is known from the pause between two."""
+def longest_session(channels: Channels) -> float:
+    """Its length (s): no lag or period is known from the pause between two."""
     if SESSION not in channels.names:
         return float(channels.epoch_time[-1] - channels.epoch_time[0])
     since = np.interp(channels.epoch_time, channels.time, _recorded(SESSION, channels))

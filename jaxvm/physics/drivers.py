@@ -278,8 +278,9 @@ def build_channels(
     start of each is one.
     """
     grid = epoch_time if recorded_time is None else recorded_time
-    moments = {name: np.asarray(own, float) for name, own in power_on.items()}
-    sessions = np.zeros(1) if starts is None else np.asarray(starts, float)
+    # As round as the grid: no start comes after the sample that stands for it.
+    moments = {name: np.round(np.asarray(own, float), 6) for name, own in power_on.items()}
+    sessions = np.zeros(1) if starts is None else np.round(np.asarray(starts, float), 6)
     if len(sessions) > 1 or any(len(own) > 1 for own in moments.values()):
         # Clocks that start anew jump; the epochs have to be on the grid to read them rightly.
         finer = np.unique(np.round(np.concatenate([grid, epoch_time]), 6))
