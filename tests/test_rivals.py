@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from scenes import recorded
 
+from jaxvm.discover.courses import Course
 from jaxvm.discover.diagnose import ROOM, _plain_fit
-from jaxvm.discover.hypotheses import Hypothesis
+from jaxvm.discover.groups import Group
+from jaxvm.discover.hypotheses import Family, Hypothesis
 from jaxvm.discover.ranking import top
 from jaxvm.discover.rivals import rivals
 from jaxvm.discover.score import ScoreTests
@@ -15,6 +17,7 @@ from jaxvm.discover.select import decisive_gap, refit, stacked
 from jaxvm.discover.space import enumerate_hypotheses
 from jaxvm.network.scene import build
 from jaxvm.network.start import start
+from jaxvm.physics.effects import Scope, Term
 from jaxvm.solve.covariance import effect_deviations
 
 PER_KELVIN = 2.8e-5
@@ -121,3 +124,28 @@ def test_a_rival_pays_no_more_for_its_instant_than_the_finding(warmed):
     chief, others = rivals(plain, found.adjustment, *own, tests, parts.n)
     (turn,) = [r for r in others if is_step(r.hypothesis, "mount.turn_y")]
     assert turn.weight > 0.3 * chief.weight * np.exp(-0.5 * turn.gap)
+
+
+def _raised(instants, drops) -> np.ndarray:
+    """Drops of ramps from some instants on, with the best one raised to the peak."""
+    group = Group((Term("sensor.focal"),), "camera")
+    family = Family(
+        groups=(group,),
+        courses=tuple(Course("time", "ramp", (instant,)) for instant in instants),
+        scopes=(Scope(),),
+        valid=np.ones((1, len(instants), 1), bool),
+        kinds=("time",) * len(instants),
+        asked=(1,) * len(instants),
+        named={},
+    )
+    return family.at_peaks(np.array(drops, float)[None, :, None])[0, :, 0]
+
+
+def test_a_peak_lies_between_points_of_a_grid_and_in_none_of_its_gaps():
+    # A parabola over the log of the constant is met exactly...
+    x = np.log([100.0, 200.0, 400.0])
+    drops = 70.0 - 30.0 * (x - np.log(230.0)) ** 2
+    np.testing.assert_allclose(_raised(np.exp(x), drops), [drops[0], 70.0, drops[2]], rtol=1e-12)
+    # ... and not through the night between two sessions, where it would rise to thousands.
+    drops = [2.0, 65.0, 64.0]
+    np.testing.assert_array_equal(_raised([1600.0, 86_500.0, 86_630.0], drops), drops)

@@ -21,6 +21,9 @@ from jaxvm.physics.ports import PORTS
 FREE = 8
 """A hypothesis with more columns than this is a free form: a curve or a map."""
 
+_UNEVEN = 4.0
+"""Ratio of two neighbouring steps of a grid from which the wider one is a gap in it."""
+
 
 @dataclass(frozen=True)
 class Family:
@@ -75,7 +78,8 @@ class Family:
 
         The grid of a time constant is coarse: between its points the largest value is that of the
         parabola through the best point and its neighbours, over the log of the constant. Courses
-        with no refined constant, or with several, are left as they are.
+        with no refined constant, or with several, are left as they are, and so is a point beside a
+        gap of the grid: a parabola knows nothing of what is there.
         """
         raised = values.copy()
         for (_, form), places in self.by_driver_and_form().items():
@@ -88,6 +92,10 @@ class Family:
             own = values[:, places]
             at = np.argmax(own, axis=1)
             g, s = np.nonzero((at > 0) & (at < len(places) - 1) & np.isfinite(own).all(axis=1))
+            steps = np.stack([np.diff(x)[:-1], np.diff(x)[1:]])
+            even = steps.max(axis=0) <= _UNEVEN * steps.min(axis=0)
+            here = even[at[g, s] - 1]
+            g, s = g[here], s[here]
             k = at[g, s]
             near = k + np.array([[-1], [0], [1]])
             raised[g, np.array(places)[k], s] = _peak(x[near], own[g, near, s])
