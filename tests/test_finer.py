@@ -188,7 +188,7 @@ def with_hidden(form, constants, terms, amplitudes, scope):
             (Term("target.bow_x"),), (1e-6, 3e-5), Scope(target=("board",)),
         ),
         (
-            "staircase", (3.1, 0.31),
+            "staircase", (1.77, 0.19),
             (Term("sensor.focal"),), (4e-4,), Scope(camera=("cam",)),
         ),
     ],

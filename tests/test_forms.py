@@ -399,20 +399,22 @@ def test_channels_of_a_recording():
 def test_course_of_an_effect_by_hand():
     """amplitude x weight x lag of the centred channel, on its own port, and on no other."""
     got = port_courses(WARMING)
-    follow = np.interp(EPOCHS, GRID, np.asarray(lag(CELSIUS - 20.5, GRID, 700.0)))
+    # Exact for a driver that is linear between samples: in the epochs, too.
+    at = np.unique(np.concatenate([GRID, EPOCHS]))
+    follow = np.asarray(lag(np.interp(at, GRID, CELSIUS) - 20.5, at, 700.0))
+    follow = follow[np.searchsorted(at, EPOCHS)]
     expected = np.zeros((N_PORTS, len(EPOCHS)))
     expected[PORT_INDEX["sensor.focal"]] = 1e-4 * follow
     expected[PORT_INDEX["sensor.cx"]] = 0.3 * -2.0 * follow
-    np.testing.assert_allclose(got, expected, rtol=1e-12, atol=1e-16)
+    np.testing.assert_allclose(got, expected, rtol=1e-7, atol=1e-12)
 
 
 def test_amplitudes_are_ordered_term_by_term():
     """(1, 2) are the first term's linear and square amplitudes, (3, 4) the second's."""
     got = port_courses(SWAYING)
-    x = WIND - 0.1
+    x = np.interp(EPOCHS, GRID, WIND) - 0.1
     for port, linear, square in (("station.turn_x", 1.0, 2.0), ("sensor.focal", 3.0, 4.0)):
-        expected = np.interp(EPOCHS, GRID, linear * x + square * x**2)
-        np.testing.assert_allclose(got[PORT_INDEX[port]], expected, rtol=1e-12, atol=1e-13)
+        np.testing.assert_allclose(got[PORT_INDEX[port]], linear * x + square * x**2, atol=1e-6)
     assert SWAYING.n_columns == 4
 
 
@@ -420,10 +422,22 @@ def test_a_form_that_is_not_centred_ignores_the_reference():
     moved = Effect(**{**SETTLING.__dict__, "reference": 500.0})
     assert np.array_equal(port_courses(moved), port_courses(SETTLING))
     expected = -0.02 * np.expm1(-(EPOCHS + 400.0) / 1500.0)
-    # The course is curved between the samples of the grid, which are read linearly.
-    chord = np.max(np.diff(GRID)) ** 2 / 8 * 0.02 / 1500.0**2
+    # The course is curved between the samples of the log: the epochs are samples, too.
     got = port_courses(SETTLING)[PORT_INDEX["structure.shift_y"]]
-    np.testing.assert_allclose(got, expected, atol=chord)
+    np.testing.assert_allclose(got, expected, rtol=1e-9)
+
+
+def test_an_epoch_between_two_samples_of_a_log_is_on_one_side_of_a_step():
+    """Whatever else is logged, and however seldom."""
+    before, after = EPOCHS[11] - 1.0, EPOCHS[11] + 1.0
+    for instant, share in ((before, 1.0), (after, 0.0)):
+        channels = build_channels(EPOCHS, {"body": CELSIUS[::20]}, GRID[::20], power_on={})
+        terms = (Term("structure.shift_y"),)
+        step = Effect("it slips", terms, "time", "step", (instant - EPOCHS[0],), amplitudes=(1.0,))
+        table, _, own = tabulate((step,), channels, 4, 4)
+        course = np.asarray(courses(table, jnp.asarray(own), channels))[0]
+        np.testing.assert_allclose(course[11], share, atol=1e-12)
+        np.testing.assert_array_equal(np.unique(course.round(12)), [0.0, 1.0])
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0), (1, 0, 2)])

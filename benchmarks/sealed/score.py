@@ -106,16 +106,25 @@ def shown_of_all(folder: Path, entries: list[dict], jobs: int, again: bool) -> d
     return known
 
 
+def diagnosed(folder: Path, entries: list[dict]) -> list[dict]:
+    """Entries of the recordings that the diagnosis was given, whether it failed or not."""
+    given = []
+    for entry in entries:
+        reports = folder / "reports" / entry["id"]
+        if (reports / "report.json").exists() or (reports / "failed.txt").exists():
+            given.append(entry)
+        else:
+            print(f"{entry['id']} is left out: not diagnosed yet")
+    return given
+
+
 def judged(folder: Path, entries: list[dict], known: dict[str, dict]) -> list[dict]:
     """Rows of results of all recordings that were given to the diagnosis."""
     rows = []
     for entry in entries:
-        reports = folder / "reports" / entry["id"]
-        file = reports / "report.json"
-        if entry["id"] not in known or not (file.exists() or (reports / "failed.txt").exists()):
-            print(f"{entry['id']} is left out: " + (
-                "not diagnosed yet" if entry["id"] in known else "its power is not known"
-            ))  # fmt: skip
+        file = folder / "reports" / entry["id"] / "report.json"
+        if entry["id"] not in known:
+            print(f"{entry['id']} is left out: its power is not known")
             continue
         report = json.loads(file.read_text()) if file.exists() else None
         rows.append(judge(entry, report, known[entry["id"]]) | {"benchmark": folder.name})
@@ -145,6 +154,7 @@ def main() -> None:
             entries, digest = sealed_key(folder)
         except (OSError, ValueError) as problem:
             parser.error(str(problem))
+        entries = diagnosed(folder, entries)
         known = shown_of_all(folder.resolve(), entries, options.jobs, options.again)
         own = judged(folder, entries, known)
         text = json.dumps(results(own, [digest]), indent=1)

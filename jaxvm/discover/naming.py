@@ -5,7 +5,7 @@ tried under other names beside all the others, is weighed against its rivals aga
 the likeliest of them, where held-out epochs don't speak against it.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -48,6 +48,9 @@ class Naming:
     tests: ScoreTests
     parts: Split
     heldout: HeldOut
+    _left: dict[int, tuple[Adjustment, Adjustment, ScoreTests]] = field(default_factory=dict)
+    """By the place of a finding the last fit with it, that without it, and the tests of that: where
+    no name changed, rivals are weighed by what names were looked for with."""
 
     def last(self, current: Adjustment, findings: list[Finding]) -> Named:
         """The fit and its findings with their last names, weights and rivals.
@@ -79,9 +82,9 @@ class Naming:
         finding = findings[k]
         if hidden(current, findings, k):
             return finding
-        without = self._without(current, findings, k)
+        without, tests = self._without(current, findings, k)
         variance = robust_variance(without)
-        ranking = self.tests.at(without).score(variance)
+        ranking = tests.score(variance)
         leading = shortlist(ranking, current.scene, variance, self.parts.n, _LEADING, FREE)
         own = finding.hypothesis
         least = next((e for h, e, _ in leading if h.same(own)), -np.inf) - _BEHIND
@@ -123,7 +126,7 @@ class Naming:
         finding = findings[k]
         if hidden(current, findings, k):
             return finding
-        without = self._without(current, findings, k)
+        without, tests = self._without(current, findings, k)
         shown = [
             (r.hypothesis, np.zeros(0), 2.0 * np.log(max(finding.weight, 1e-9) / r.weight))
             for r in finding.rivals
@@ -133,15 +136,22 @@ class Naming:
             current,
             finding.hypothesis,
             current.scene.fitted_effects()[given_effects(current, findings) + k],
-            self.tests.at(without),
+            tests,
             self.parts.n,
             shown,
             finding.noise,
         )
         return replace(finding, weight=chief.weight, others=chief.others, rivals=tuple(doubles))
 
-    def _without(self, current: Adjustment, findings: list[Finding], k: int) -> Adjustment:
-        """The fit with all findings but one."""
-        effects, place = current.scene.fitted_effects(), given_effects(current, findings) + k
-        others = (*effects[:place], *effects[place + 1 :])
-        return self.parts.fit(current.scene.with_effects(others, current.scene.room))
+    def _without(
+        self, current: Adjustment, findings: list[Finding], k: int
+    ) -> tuple[Adjustment, ScoreTests]:
+        """The fit with all findings but one, and its tests."""
+        place = given_effects(current, findings) + k
+        known = self._left.get(place)
+        if known is None or known[0] is not current:
+            effects = current.scene.fitted_effects()
+            others = (*effects[:place], *effects[place + 1 :])
+            without = self.parts.fit(current.scene.with_effects(others, current.scene.room))
+            known = self._left[place] = current, without, self.tests.at(without)
+        return known[1:]

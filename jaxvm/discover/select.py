@@ -14,6 +14,7 @@ from jaxvm.discover.heldout import Split
 from jaxvm.discover.hypotheses import FREE, Hypothesis
 from jaxvm.discover.one_course import lost_by_one_course
 from jaxvm.discover.ranking import Ranking, top
+from jaxvm.discover.sides import on_better_sides
 from jaxvm.network.scene import Scene
 from jaxvm.physics.catalogue import Entry
 from jaxvm.physics.effects import Effect, room_for
@@ -262,9 +263,10 @@ def refit(base: Adjustment, hypothesis: Hypothesis, amplitudes, split: Split) ->
         # The grid's constants are good enough when a refined one runs away.
         if not freed.failed and sensible(scene, freed.scene.fitted_effects()[-1]):
             fitted = freed
-    effect = fitted.scene.fitted_effects()[-1]
     if fitted.failed:
         return None
+    fitted = on_better_sides(fitted, fit, split.weights)
+    effect = fitted.scene.fitted_effects()[-1]
     variance = fitted.variance_factor
     drop = 2.0 * (base.cost - fitted.cost)
     spread = spread_of(fitted, -1, hypothesis, variance)

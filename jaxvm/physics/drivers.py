@@ -281,11 +281,11 @@ def build_channels(
     # As round as the grid: no start comes after the sample that stands for it.
     moments = {name: np.round(np.asarray(own, float), 6) for name, own in power_on.items()}
     sessions = np.zeros(1) if starts is None else np.round(np.asarray(starts, float), 6)
-    if len(sessions) > 1 or any(len(own) > 1 for own in moments.values()):
-        # Clocks that start anew jump; the epochs have to be on the grid to read them rightly.
-        finer = np.unique(np.round(np.concatenate([grid, epoch_time]), 6))
-        recorded = {name: np.interp(finer, grid, values) for name, values in recorded.items()}
-        grid = finer
+    # What jumps (an effect at its instant, a clock that starts anew) jumps between two samples: the
+    # epochs have to be on the grid to be on one side or the other.
+    finer = np.unique(np.round(np.concatenate([grid, epoch_time]), 6))
+    recorded = {name: np.interp(finer, grid, values) for name, values in recorded.items()}
+    grid = finer
     if len(grid) == 1:
         # Forms with a memory need two samples; nothing changes between them.
         grid = grid[0] + np.array([0.0, 1.0])
