@@ -8,12 +8,14 @@ from networks import board_recording, predicted
 
 from jaxvm.discover import courses
 from jaxvm.discover.constants import constants_held, jumps_of, other_instants, run_away
-from jaxvm.discover.courses import gaps
+from jaxvm.discover.courses import Course, gaps
 from jaxvm.discover.diagnose import _plain_fit
 from jaxvm.discover.finer import at_finer_constants, best_of, said, scores_about
+from jaxvm.discover.groups import Group
 from jaxvm.discover.heldout import evaluate, split
+from jaxvm.discover.hypotheses import Hypothesis
 from jaxvm.discover.score import ScoreTests
-from jaxvm.discover.select import shortlist
+from jaxvm.discover.select import refit, shortlist
 from jaxvm.discover.space import enumerate_hypotheses
 from jaxvm.physics.effects import Effect, Scope, Term
 from jaxvm.recording.recording import Drivers
@@ -211,3 +213,34 @@ def test_constants_are_found_between_points_of_the_grid(form, constants, terms, 
     assert best[1] > own[1] + 5.0
     assert best[0].course.constants[0] == pytest.approx(constants[0], rel=0.05)
     assert said(best[0]) in about
+
+
+# --- large steps ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("off", [-3, -1, 2])
+def test_a_step_is_refitted_beyond_epochs_that_fit_badly(off):
+    """A first instant that is some epochs off costs no second jump."""
+    known = board_recording(n_epochs=N_EPOCHS)
+    plain = known.true_scene()
+    middles = gaps("time", plain.network.channels)
+    bent = Hypothesis(
+        Group((Term("target.bow_x"),), "target"),
+        Course("time", "step", (float(middles[40]),)),
+        Scope(target=("board",)),
+        (),
+    )
+    obs = known.recording.observations
+    truth = plain.with_effects((bent.effect((3e-3,)),), (8, 4))
+    pixel = predicted(truth)
+    pixel += obs.sigma[:, None] * np.random.default_rng(5).standard_normal(pixel.shape)
+    scene = known.true_scene(replace(known.recording, observations=replace(obs, pixel=pixel)))
+    parts, fitted, _ = _plain_fit(scene, 3)
+    other = replace(bent, course=replace(bent.course, constants=(float(middles[40 + off]),)))
+    found = refit(fitted, other, np.zeros(1), parts)
+    assert found is not None
+    # The fitted epochs leave open on which side of the step a held-out one lies.
+    (instant,) = found.effect.constants
+    at = np.asarray(scene.network.channels.epoch_time)[~parts.held]
+    assert np.sum(at > instant) == np.sum(at > middles[40])
+    np.testing.assert_allclose(found.effect.amplitudes, (3e-3,), rtol=0.02)

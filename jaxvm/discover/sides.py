@@ -1,7 +1,8 @@
 """Steps whose instant is an epoch or two off.
 
-One tangent knows little of a large effect: it may put an epoch on the wrong side of a step. Refitted
-there, the step leaves that epoch far worse than all others, and a second jump would explain it.
+One tangent knows little of a large effect: it may put an epoch on the wrong side of a step.
+Refitted there, the step leaves that epoch far worse than all others, and a second jump would
+explain it.
 """
 
 from collections.abc import Callable, Iterator
@@ -25,7 +26,7 @@ _MOST = 6
 def on_better_sides(
     fitted: Adjustment, fit: Callable[[Scene], Adjustment], weights: tuple[np.ndarray, ...]
 ) -> Adjustment:
-    """The fit with the jumps of its last effect beyond epochs that fit badly, as long as that helps.
+    """The fit with the jumps of its last effect beyond epochs that fit badly, while that helps.
 
     Args:
         fitted: with the effect last.
