@@ -15,6 +15,7 @@ from jaxvm.discover.groups import Group
 from jaxvm.discover.heldout import evaluate, split
 from jaxvm.discover.hypotheses import Hypothesis
 from jaxvm.discover.score import ScoreTests
+from jaxvm.discover.search import Search
 from jaxvm.discover.select import refit, shortlist
 from jaxvm.discover.space import enumerate_hypotheses
 from jaxvm.physics.effects import Effect, Scope, Term
@@ -213,6 +214,21 @@ def test_constants_are_found_between_points_of_the_grid(form, constants, terms, 
     assert best[1] > own[1] + 5.0
     assert best[0].course.constants[0] == pytest.approx(constants[0], rel=0.05)
     assert said(best[0]) in about
+
+
+@pytest.mark.parametrize("flat_at, form", [(21.27, "linear"), (0.0, "affine")])
+def test_what_follows_the_air_from_a_reference_of_its_own_is_one_effect(flat_at, form):
+    """The mean over the recording, 21.27 degrees, is but a guess of where nothing was bent."""
+    scope, slope = Scope(target=("board",)), 1e-5
+    amplitudes = (-slope * flat_at, slope)
+    scene = with_hidden("affine", (), (Term("target.bow_x"),), amplitudes, scope)
+    parts, plain, _ = _plain_fit(scene, 3)
+    plain, heldout = parts.proven(plain)
+    search = Search(parts, plain, heldout, 0)
+    search.run(3, lambda line: None)
+    (found,) = search.findings
+    assert found.hypothesis.entries[0].id == "target-bends"
+    assert (found.hypothesis.course.driver, found.hypothesis.course.form) == ("ambient_degC", form)
 
 
 # --- large steps ----------------------------------------------------------------------------------

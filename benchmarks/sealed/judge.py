@@ -258,11 +258,13 @@ def _shown_values(truth: dict, finding: dict) -> dict[str, float]:
 def _in_units_of(finding: dict, value: float, told: dict) -> float | None:
     """A true size per unit of the driver; the key gives what grows in time at its end.
 
-    A quantity less its own lag is the time constant times its rate.
+    What settles has no rate. A quantity less its own lag is the time constant times its rate.
     """
     if "end_s" in told:
         own = value / (told["end_s"] - told["t0_s"])
         return own if finding.get("form") == "ramp" else None
+    if finding.get("form") == "ramp":
+        return None
     if "rate_s" in told and finding.get("form") != "rate":
         own = value * told["rate_s"] / told["tau_s"]
         return own if finding.get("form", "").startswith("transient") else None

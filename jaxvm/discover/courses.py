@@ -143,6 +143,9 @@ def _of_quantity(driver: str, channels: Channels, lags: list[float]) -> list[Cou
             for form in ("lag", "lag with state")
             for tau in lags
         ),
+        # Nobody logs at which value a camera was calibrated: the mean is but a guess.
+        Course(driver, "affine", (), reference),
+        *(Course(driver, "affine lag", (tau,), reference) for tau in lags[1::2]),
         Course(driver, "lag", (_quick(lags)[-1],), reference),
         *(Course(driver, "delay", (late,), reference) for late in (*_quick(lags), *lags[:3])),
         Course(driver, "two lags", (lags[1], lags[4]), reference),
@@ -234,6 +237,8 @@ def _of_time(driver: str, channels: Channels, lags: list[float]) -> list[Course]
         # Named only where nobody noted when the cameras were switched on.
         *_warming_up(driver, lags),
         Course(driver, "linear", (), _reference(driver, channels)),
+        # What ages has done so before the recording, too.
+        Course(driver, "affine", (), _reference(driver, channels)),
         Course(driver, "proportional"),
         *(Course(driver, "step", (t,)) for t in instants.tolist()),
         *(Course(driver, "ramp", (t,)) for t in np.quantile(since, _RAMPS).tolist()),

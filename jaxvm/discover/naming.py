@@ -83,7 +83,8 @@ class Naming:
         if hidden(current, findings, k):
             return finding
         without, tests = self._without(current, findings, k)
-        variance = robust_variance(without)
+        # What is left with the finding is noise; without it, it is a part of itself.
+        variance = min(robust_variance(without), robust_variance(current))
         ranking = tests.score(variance)
         leading = shortlist(ranking, current.scene, variance, self.parts.n, _LEADING, FREE)
         own = finding.hypothesis

@@ -63,7 +63,7 @@ CHANGING = ("rate", "transient", "transient with state")
 WARMING_UP = ("onset", "fading", "two decays")
 """Forms of what settles after power-on: calibrated cold, or calibrated warm and recorded cold."""
 
-SETTLING = ("linear", "proportional", "onset", "creep", "ramp", "settling")
+SETTLING = ("linear", "affine", "proportional", "onset", "creep", "ramp", "settling")
 """Forms of what moves slowly one way."""
 
 ALWAYS = ("constant",)
