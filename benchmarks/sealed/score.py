@@ -148,12 +148,13 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--again", action="store_true", help="compute what is cached anew")
     options = parser.parse_args()
-    rows, digests = [], []
+    rows, digests, made = [], [], 0
     for folder in options.folders:
         try:
             entries, digest = sealed_key(folder)
         except (OSError, ValueError) as problem:
             parser.error(str(problem))
+        made += len(entries)
         entries = diagnosed(folder, entries)
         known = shown_of_all(folder.resolve(), entries, options.jobs, options.again)
         own = judged(folder, entries, known)
@@ -162,7 +163,8 @@ def main() -> None:
         rows += own
         digests.append(digest)
     label = options.label or "-".join(folder.resolve().name for folder in options.folders)
-    page = markdown(rows, f"Sealed benchmark {label}", digests)
+    part = "" if len(rows) == made else f" ({len(rows)} of {made} recordings)"
+    page = markdown(rows, f"Sealed benchmark {label}{part}", digests)
     (HERE / f"results-{label}.md").write_text(page, encoding="utf-8")
     print(page.split("## What went wrong")[0])
     print(f"written {HERE / f'results-{label}.md'}")
