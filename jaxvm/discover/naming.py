@@ -83,8 +83,7 @@ class Naming:
         if hidden(current, findings, k):
             return finding
         without, tests = self._without(current, findings, k)
-        # What is left with the finding is noise; without it, it is a part of itself.
-        variance = min(robust_variance(without), robust_variance(current))
+        variance = robust_variance(without)
         ranking = tests.score(variance)
         leading = shortlist(ranking, current.scene, variance, self.parts.n, _LEADING, FREE)
         own = finding.hypothesis

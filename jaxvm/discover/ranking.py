@@ -1,6 +1,6 @@
 """What the scores say: which hypotheses lead, and how likely noise alone gives as much."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -41,12 +41,6 @@ class Scores:
         """Number of hypotheses scored."""
         return int(self.valid.sum())
 
-    def at(self, variance: float) -> "Scores":
-        """The same under another variance of unit weight, but for the null distribution."""
-        z = np.full_like(self.z, -np.inf)
-        z[self.valid] = surprise(self.drop[self.valid] / variance, self.amplitude.shape[-1])
-        return replace(self, z=z, variance=variance)
-
 
 @dataclass(frozen=True)
 class Ranking:
@@ -59,17 +53,6 @@ class Ranking:
     def n(self) -> int:
         """Number of hypotheses scored."""
         return sum(s.n for s in self.scores)
-
-    def at(self, variance: float) -> "Ranking":
-        """The same scores under another variance of unit weight.
-
-        The null distribution is that of the residuals as they are, and belongs to no other.
-        """
-        return replace(self, scores=tuple(own.at(variance) for own in self.scores))
-
-    def most(self) -> float:
-        """Largest predicted drop of chi-square, of residuals with unit variance."""
-        return max((float(s.drop[s.valid].max()) for s in self.scores if s.n), default=0.0)
 
     def best_z(self) -> float:
         """Largest statistic."""

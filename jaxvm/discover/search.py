@@ -34,9 +34,6 @@ ALPHA = 0.01
 _TURNS = 3
 """Findings that in turn only took the place of another, until they are as good as each other."""
 
-_QUIETEST = 0.01
-"""Share of the variance that is left at least when the best hypothesis is taken out."""
-
 FLIPS = 199
 """Repetitions of the null distribution."""
 
@@ -68,7 +65,6 @@ class Search:
     p_value: float = 1.0
     unproven: str = ""
     ranking: Ranking = field(init=False)
-    _sharper: Ranking = field(init=False)
     _tests: ScoreTests = field(init=False)
     _signs: np.ndarray = field(init=False)
     _hopeless: set = field(default_factory=set)
@@ -113,11 +109,11 @@ class Search:
             if len(self.findings) == most or turns == _TURNS:
                 break
             leading, self._finer = at_finer_constants(
-                leading, self._tests, self._sharper, self.parts.n
+                leading, self._tests, self.ranking, self.parts.n
             )
-            leading = with_slow_beginnings(leading, self._sharper, self.current.scene)
+            leading = with_slow_beginnings(leading, self.ranking, self.current.scene)
             if self.p_value <= self.alpha:
-                leading = with_jumps(leading, self._tests, self._sharper, self.parts.n)
+                leading = with_jumps(leading, self._tests, self.ranking, self.parts.n)
             accepted = self._accepted(leading, progress)
             scored = self.p_value
             # What no course explains may be a wave, or differ from image to image.
@@ -144,11 +140,7 @@ class Search:
         variance = robust_variance(current)
         self._tests = self._tests.at(current)
         self.ranking = self._tests.score(variance, self._signs)
-        # What is large is noise to itself: by what the best one leaves, hypotheses are weighed.
-        left = (2.0 * current.cost - self.ranking.most()) / current.degrees_of_freedom
-        self._sharper = self.ranking.at(min(variance, max(left, _QUIETEST * variance)))
-        variance = self._sharper.scores[0].variance
-        foremost = shortlist(self._sharper, current.scene, variance, self.parts.n, 12)
+        foremost = shortlist(self.ranking, current.scene, variance, self.parts.n, 12)
         self.p_value = self.ranking.p_value(self.ranking.best_z())
         if self.p_value > self.alpha and foremost:
             self.p_value = self._p_without(*foremost[0][::2])
