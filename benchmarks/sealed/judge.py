@@ -260,11 +260,10 @@ def _in_units_of(finding: dict, value: float, told: dict) -> float | None:
 
     What settles has no rate. A quantity less its own lag is the time constant times its rate.
     """
-    if "end_s" in told:
-        own = value / (told["end_s"] - told["t0_s"])
-        return own if finding.get("form") == "ramp" else None
-    if finding.get("form") == "ramp":
+    if ("end_s" in told) != (finding.get("form") == "ramp"):
         return None
+    if "end_s" in told:
+        return value / (told["end_s"] - told["t0_s"])
     if "rate_s" in told and finding.get("form") != "rate":
         own = value * told["rate_s"] / told["tau_s"]
         return own if finding.get("form", "").startswith("transient") else None

@@ -71,21 +71,25 @@ def jumps_of(scene: Scene) -> list[tuple[int, int]]:
     ]
 
 
-def other_instants(scene: Scene, jump: tuple[int, int], fitted: np.ndarray) -> Iterator[Scene]:
-    """Scenes with a jump on the other side of an epoch beside it that was not fitted.
+def other_instants(
+    scene: Scene, jump: tuple[int, int], sure: np.ndarray, seen: np.ndarray | None = None
+) -> Iterator[Scene]:
+    """Scenes with a jump on the other side of an epoch beside it whose side is open.
 
-    The fitted epochs leave open on which side of the jump such an epoch lies.
+    That is an epoch which was not fitted, or which fits badly where it is.
 
     Args:
         scene: a fitted scene.
         jump: number of the effect, and of its instant (`jumps_of`).
-        fitted: for each epoch whether it was fitted.
+        sure: for each epoch whether its side is known.
+        seen: the epochs that count at all; all of them where it is not given.
     """
     (number, k), effects = jump, list(scene.fitted_effects())
     instants = list(effects[number].constants)
     at = at_epochs(effects[number].driver, scene.network.channels)
     order = np.argsort(at)
-    at, sure = at[order], fitted[order]
+    order = order if seen is None else order[seen[order]]
+    at, sure = at[order], sure[order]
     first = int(np.searchsorted(at, instants[k]))
     for beside, gap in ((first - 1, first - 1), (first, first + 1)):
         if 0 < gap < len(at) and not sure[beside]:

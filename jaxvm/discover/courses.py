@@ -303,7 +303,7 @@ def _reference(driver: str, channels: Channels) -> float:
 
 
 def longest_session(channels: Channels) -> float:
-    """Its length (s): no lag or period is known from the pause between two."""
+    """Length of the longest session (s): no lag or period is known from the pause between two."""
     if SESSION not in channels.names:
         return float(channels.epoch_time[-1] - channels.epoch_time[0])
     since = np.interp(channels.epoch_time, channels.time, _recorded(SESSION, channels))

@@ -87,13 +87,14 @@ class Family:
             if len(constants) != 1 or not constants[0].refined or len(places) < 3:
                 continue
             x = np.log([self.courses[place].constants[0] for place in places])
-            if (np.diff(x) <= 0.0).any():
+            step = np.diff(x)
+            if (step <= 0.0).any():
                 continue
             own = values[:, places]
             at = np.argmax(own, axis=1)
             g, s = np.nonzero((at > 0) & (at < len(places) - 1) & np.isfinite(own).all(axis=1))
-            steps = np.stack([np.diff(x)[:-1], np.diff(x)[1:]])
-            even = steps.max(axis=0) <= _UNEVEN * steps.min(axis=0)
+            beside = np.stack([step[:-1], step[1:]])
+            even = beside.max(axis=0) <= _UNEVEN * beside.min(axis=0)
             here = even[at[g, s] - 1]
             g, s = g[here], s[here]
             k = at[g, s]

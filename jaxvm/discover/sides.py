@@ -5,14 +5,13 @@ Refitted there, the step leaves that epoch far worse than all others, and a seco
 explain it.
 """
 
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Callable
+from itertools import chain
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
-from jaxvm.discover.constants import jumps_of
-from jaxvm.discover.courses import at_epochs
+from jaxvm.discover.constants import jumps_of, other_instants
 from jaxvm.network.scene import Scene
 from jaxvm.solve.adjust import Adjustment
 
@@ -33,11 +32,16 @@ def on_better_sides(
         fit: adjusts a scene to the same observations.
         weights: for each pixel table, 1 where an observation is fitted.
     """
-    for _ in range(_MOST):
+    last = len(fitted.scene.effects) - 1
+    jumps = [jump for jump in jumps_of(fitted.scene) if jump[0] == last]
+    for _ in range(_MOST if jumps else 0):
         of_epoch = mean_squares(fitted, weights)
         known = np.isfinite(of_epoch)
         bad = known & (of_epoch > _BAD * np.median(of_epoch[known]))
-        moved = [fit(scene) for scene in _beyond(fitted.scene, known, bad)]
+        others = chain.from_iterable(
+            other_instants(fitted.scene, jump, ~bad, known) for jump in jumps
+        )
+        moved = [fit(scene) for scene in others]
         best = min((m for m in moved if not m.failed), key=lambda m: m.cost, default=fitted)
         if best.cost >= fitted.cost:
             break
@@ -55,23 +59,3 @@ def mean_squares(fitted: Adjustment, weights: tuple[np.ndarray, ...]) -> Float[n
         np.add.at(square, epoch[own], np.mean(np.asarray(block)[: len(rows)][own] ** 2, axis=1))
         np.add.at(count, epoch[own], 1.0)
     return np.where(count > 0.0, square / np.maximum(count, 1.0), np.nan)
-
-
-def _beyond(
-    scene: Scene, fitted: Bool[np.ndarray, " epochs"], bad: Bool[np.ndarray, " epochs"]
-) -> Iterator[Scene]:
-    """Scenes with a jump of the last effect on the other side of a bad epoch next to it."""
-    effects = list(scene.fitted_effects())
-    last = effects[-1]
-    at = at_epochs(last.driver, scene.network.channels)
-    order = np.argsort(at)
-    order = order[fitted[order]]
-    at, bad = at[order], bad[order]
-    for k in (k for number, k in jumps_of(scene) if number == len(effects) - 1):
-        instants = list(last.constants)
-        first = int(np.searchsorted(at, instants[k]))
-        for beside, gap in ((first - 1, first - 1), (first, first + 1)):
-            if 0 < gap < len(at) and bad[beside]:
-                instants[k] = float(0.5 * (at[gap - 1] + at[gap]))
-                effects[-1] = replace(last, constants=tuple(instants))
-                yield scene.with_effects(tuple(effects), scene.room)

@@ -47,14 +47,17 @@ class Entry:
     def takes(self, kinds: tuple[str, ...], form: str) -> bool:
         """Whether a driver of any of these kinds may drive it in a form.
 
-        What jumps may jump again.
+        What jumps may jump again, and what follows may count from a reference of its own.
         """
-        known = {form, FORMS[form].single} & {*self.forms}
+        known = {form, FORMS[form].single, _FROM_ELSEWHERE.get(form, form)} & {*self.forms}
         return bool(known) and any(kind in self.drivers for kind in kinds)
 
 
+_FROM_ELSEWHERE = {"affine": "linear", "affine lag": "lag"}
+"""Forms with a reference of their own, and what they are when that is the mean."""
+
 HYSTERESIS = ("hysteresis", "hysteresis with state")
-THERMAL = ("linear", "lag", "lag with state", "delay", "two lags", "affine", "affine lag")
+THERMAL = ("linear", "lag", "lag with state", "delay", "two lags")
 """Forms of what follows a quantity, at once or late."""
 
 CHANGING = ("rate", "transient", "transient with state")
@@ -63,7 +66,7 @@ CHANGING = ("rate", "transient", "transient with state")
 WARMING_UP = ("onset", "fading", "two decays")
 """Forms of what settles after power-on: calibrated cold, or calibrated warm and recorded cold."""
 
-SETTLING = ("linear", "affine", "proportional", "onset", "creep", "ramp", "settling")
+SETTLING = ("linear", "proportional", "onset", "creep", "ramp", "settling")
 """Forms of what moves slowly one way."""
 
 ALWAYS = ("constant",)
