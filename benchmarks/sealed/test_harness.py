@@ -243,6 +243,21 @@ def test_only_like_sizes_are_compared():
     assert "other driver" in _sizes(warm, other, FACTS)["not_compared"]
 
 
+def test_a_size_is_compared_with_a_rate_only_where_the_key_tells_its_end():
+    size = {"port": "mount.turn_x", "name": "mount.turn_x", "value": 1.1e-6, "std": 1e-7}
+    where = {"camera": ["left"]}
+    ramp = {"driver": "time", "form": "ramp", "where": where, "parameters": [size]}
+    grown = {
+        "rows": [28], "driver": "time", "where": where, "values": {"mount.turn_x": 1e-4},
+        "constants": {"t0_s": 20.0, "end_s": 120.0},
+    }  # fmt: skip
+    assert _sizes(grown, ramp, FACTS)["z"] == [pytest.approx(1.0)]
+    settled = {**grown, "constants": {"t0_s": 20.0, "tau_s": 14.0}}
+    assert _sizes(settled, ramp, FACTS)["z"] == []
+    assert _sizes(grown, {**ramp, "form": "settling"}, FACTS)["z"] == []
+    assert len(_sizes(settled, {**ramp, "form": "settling"}, FACTS)["z"]) == 1
+
+
 @pytest.mark.parametrize("tau", [4.0, 45.0, 2000.0])
 def test_lags_of_the_world_are_the_differential_equation(tau):
     t = heat.STEP * np.arange(60)
