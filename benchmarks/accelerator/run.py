@@ -4,7 +4,8 @@
 
 On a machine with an accelerator (and a jaxlib that knows it) the same work runs on it and on the
 processors of that machine: Monte Carlo of relay chains and of single poses in float64 and float32,
-adjustment of blocks of images, adjustment of a relay network in one program, scoring of hypotheses.
+adjustment of blocks of images, adjustment of a relay network in one program, SPGD of many chains,
+scoring of hypotheses, a diagnosis.
 Each in a process of its own, warm, medians; compiling stands apart. What each found (costs, RMS
 errors) is compared. Without an accelerator the processors' column alone is filled, beside the other
 column of an earlier run where one is given. Writes results.json, results.md and results.png.
@@ -73,12 +74,13 @@ def studied(study, trials: int) -> dict:
     }
 
 
-def chains(trials: int, stations: int, single: bool = False) -> dict:
-    """Relay chains, each adjusted from its pixels."""
-    from jaxvm.montecarlo import GaussNewton, network_study
+def chains(trials: int, stations: int, single: bool = False, descend: bool = False) -> dict:
+    """Relay chains, each adjusted from its pixels, or descended by SPGD."""
+    from jaxvm.montecarlo import GaussNewton, Spgd, network_study
 
     own = of("monte_carlo", "run.py")
-    study = network_study(own.chain(stations), own.poses, estimator=GaussNewton(SETTLED))
+    estimator = Spgd() if descend else GaussNewton(SETTLED)
+    study = network_study(own.chain(stations), own.poses, estimator=estimator)
     return studied(study.in_single_precision() if single else study, trials)
 
 
@@ -143,6 +145,26 @@ def scoring(epochs: int, hypotheses: int) -> dict:
     }
 
 
+def diagnosis() -> dict:
+    """A station's hours, diagnosed again and again: of the sealed benchmark's world, 40,000
+    residuals, a focal length that drifts with temperature."""
+    sys.path.insert(0, str(HERE.parent / "sealed"))
+    from world import record
+
+    from jaxvm.discover import diagnose
+    from jaxvm.recording import read_recording
+
+    with tempfile.TemporaryDirectory() as place:
+        hidden = ("focal-grows-with-heat",)
+        record("station", 1001, hidden, size="large").write(Path(place, "recording"))
+        recording = read_recording(Path(place, "recording"))
+    last = diagnose(recording)
+    told = timed(lambda: diagnose(recording))
+    found = [last.plain.chi2_per_dof, last.final.chi2_per_dof]
+    found += [size for one in last.findings for size in one.final_stds]
+    return told | {"first_s": last.seconds, "found": found}
+
+
 WORK: dict[str, tuple[str, Callable[[], dict]]] = {
     "chains": ("10,000 chains of 6 stations, float64", lambda: chains(10_000, 6)),
     "many-chains": ("100,000 chains of 6 stations, float64", lambda: chains(100_000, 6)),
@@ -151,6 +173,7 @@ WORK: dict[str, tuple[str, Callable[[], dict]]] = {
         "100,000 chains of 3 stations, float32",
         lambda: chains(100_000, 3, single=True),
     ),
+    "spgd": ("256 chains of 3 stations by SPGD", lambda: chains(256, 3, descend=True)),
     "poses": ("200,000 poses from 20 points, float64", lambda: poses(200_000)),
     "poses-single": ("200,000 poses from 20 points, float32", lambda: poses(200_000, single=True)),
     "relay": ("a chain of 48 stations adjusted in one program", lambda: relay(48)),
@@ -158,6 +181,7 @@ WORK: dict[str, tuple[str, Callable[[], dict]]] = {
     "block-257": ("block of 257 cameras, 65,132 points", lambda: block(257, 65_132, 3.5)),
     "block-961": ("block of 961 cameras, 187,103 points", lambda: block(961, 187_103, 9.0)),
     "scoring": ("10,000 hypotheses on 100,000 residuals", lambda: scoring(240, 10_000)),
+    "diagnosis": ("diagnosis of 40,000 residuals", diagnosis),
 }
 """What is done, by name."""
 
@@ -243,7 +267,9 @@ def draw(found: dict) -> Figure:
         seconds = [row[side].get("seconds", np.nan) for row in rows]
         axis.barh(np.arange(len(rows)) + 0.4 * k, seconds, 0.4, label=names[side])
     axis.set_yticks(np.arange(len(rows)) + 0.2, [row["what"] for row in rows])
-    axis.set(xscale="log", xlabel="seconds, warm")
+    # While nothing is measured yet there is no logarithm.
+    known = any("seconds" in row[side] for row in rows for side in names)
+    axis.set(xscale="log" if known else "linear", xlabel="seconds, warm")
     figure.legend(loc="outside lower center", ncols=2)
     return figure
 

@@ -21,6 +21,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Int
 
+from jaxvm import __version__
 from jaxvm.montecarlo.trials import Trial
 from jaxvm.recording.files import json_text, one_sentence, write_files
 
@@ -143,5 +144,5 @@ def _parts(manifest: Mapping[str, Any]) -> dict[str, Any]:
 
 def versions() -> dict[str, str]:
     """What computed: the package, JAX, NumPy, Python."""
-    found = {name: version(name) for name in ("jaxvm", "jax", "numpy")}
-    return {**found, "python": platform.python_version()}
+    found = {name: version(name) for name in ("jax", "numpy")}
+    return {"jaxvm": __version__, **found, "python": platform.python_version()}
