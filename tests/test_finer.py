@@ -16,7 +16,7 @@ from jaxvm.discover.heldout import evaluate, split
 from jaxvm.discover.hypotheses import Hypothesis
 from jaxvm.discover.score import ScoreTests
 from jaxvm.discover.search import Search
-from jaxvm.discover.select import refit, shortlist
+from jaxvm.discover.select import Weighing, refit, shortlist
 from jaxvm.discover.space import enumerate_hypotheses
 from jaxvm.physics.effects import Effect, Scope, Term
 from jaxvm.recording.recording import Drivers
@@ -56,7 +56,7 @@ def test_the_gap_is_found_between_points_of_the_grid(recorded, monkeypatch):
     tests = ScoreTests.of(plain, enumerate_hypotheses(plain.scene))
     variance = robust_variance(plain)
     ranking = tests.score(variance)
-    leading = shortlist(ranking, plain.scene, variance, parts.n, 12)
+    leading = shortlist(ranking, plain.scene, Weighing(variance, parts.n), 12)
     step = next(item for item in leading if item[0].course.form == "step")
     finer = scores_about(tests, ranking, step[0], variance)
     assert finer is not None
@@ -203,12 +203,12 @@ def test_constants_are_found_between_points_of_the_grid(form, constants, terms, 
     tests = ScoreTests.of(plain, enumerate_hypotheses(plain.scene))
     variance = robust_variance(plain)
     ranking = tests.score(variance)
-    leading = shortlist(ranking, plain.scene, variance, parts.n, 12)
+    leading = shortlist(ranking, plain.scene, Weighing(variance, parts.n), 12)
     own = next(
         item for item in leading
         if (item[0].course.form, item[0].group.terms, item[0].scope) == (form, terms, scope)
     )  # fmt: skip
-    finer, about = at_finer_constants(leading, tests, ranking, parts.n)
+    finer, about = at_finer_constants(leading, tests, ranking, Weighing.at(plain, ranking, parts.n))
     best = next(item for item in finer if item[0].group.terms == terms and item[0].scope == scope)
     assert best[0].course.form == form
     assert best[1] > own[1] + 5.0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from networks import board_recording, predicted, stereo_recording
 
-from jaxvm.discover.accept import STRONG, _is_determined, accept
+from jaxvm.discover.accept import STRONG, _is_determined, _is_foretold, accept
 from jaxvm.discover.courses import Course
 from jaxvm.discover.diagnose import _plain_fit
 from jaxvm.discover.groups import Group
@@ -29,6 +29,15 @@ AGES = Hypothesis(
     CAMERA,
     entries_for(FOCAL, "camera", ("time",), "linear"),
 )
+MARKS = each("mark", "target.point_z", numbers=range(30))
+BOARD = Scope(target=("board",))
+DEPTHS = Hypothesis(
+    Group(MARKS, "target"),
+    Course("constant", "constant"),
+    BOARD,
+    entries_for(MARKS, "target", ("constant",), "constant"),
+)
+ROOM = 64, 8
 
 
 @pytest.fixture(scope="module")
@@ -38,17 +47,28 @@ def known():
 
 def drawn(known, per_second: float, seed: int):
     """The split, the plain fit and that with the drift, of a camera whose focal length drifts."""
-    plain = known.true_scene()
     drift = Effect("drift", FOCAL, "time", "linear", (), 0.0, CAMERA, (per_second,))
-    truth = plain.with_effects((drift,), (16, 8))
+    return refitted(known, drift, AGES, seed)
+
+
+def raised(known, metres: float, seed: int):
+    """The same of a board whose marks stand at depths of their own, up to a few times so many."""
+    depths = metres * np.random.default_rng(100 + seed).standard_normal(len(MARKS))
+    true = Effect("depths", MARKS, "constant", "constant", (), 0.0, BOARD, tuple(depths))
+    return refitted(known, true, DEPTHS, seed)
+
+
+def refitted(known, true: Effect, hypothesis: Hypothesis, seed: int):
+    """The split, the plain fit, that with the hypothesis, and the candidate that it is of."""
+    truth = known.true_scene().with_effects((true,), ROOM)
     obs = known.recording.observations
     pixel = predicted(truth)
     pixel += obs.sigma[:, None] * np.random.default_rng(seed).standard_normal(pixel.shape)
     recording = replace(known.recording, observations=replace(obs, pixel=pixel))
-    scene = known.true_scene(recording).with_effects((), (16, 8))
+    scene = known.true_scene(recording).with_effects((), ROOM)
     parts, before, _ = _plain_fit(scene, 3)
     before, _ = parts.proven(before)
-    found = refit(before, AGES, np.zeros(1), parts)
+    found = refit(before, hypothesis, np.zeros(hypothesis.n_columns), parts)
     assert found is not None
     after, _ = parts.proven(found.adjustment)
     return parts, before, after, found
@@ -104,14 +124,24 @@ def log_density(scene, parts, variance: float) -> float:
 def test_the_odds_are_those_of_the_two_forecasts(known, per_second):
     parts, before, after, _ = drawn(known, per_second, seed=4)
     dense = [log_density(fit.scene, parts, after.variance_factor) for fit in (after, before)]
-    # The determinants are taken to grow with the number of observations.
-    assert odds(parts, before, after) == pytest.approx(dense[0] - dense[1], abs=0.1)
+    assert odds(parts, before, after) == pytest.approx(dense[0] - dense[1], abs=0.05)
 
 
 def test_noise_gets_odds_against_it_and_an_effect_odds_for_it(known):
     noise, effect = ([drawn_odds(known, size, k) for k in range(12)] for size in (0.0, 1e-3))
     assert np.mean(noise) < 0.0 and np.max(noise) < 6.0
     assert np.mean(effect) > 10.0 and np.mean(np.array(effect) > 0.0) > 0.9
+
+
+def test_depths_of_marks_get_odds_for_them_where_there_are_any(known):
+    """A forecast of thirty amounts is vague, but their spread is known."""
+    both = [[raised(known, size, k) for k in range(8)] for size in (0.0, 1e-4)]
+    noise, effect = ([odds(*fits) for *fits, _ in some] for some in both)
+    assert np.max(noise) < 0.0 and np.min(effect) > 0.0
+    *_, found = both[1][0]
+    assert _is_foretold(found)
+    unnamed = replace(found, hypothesis=replace(found.hypothesis, entries=()))
+    assert not _is_foretold(unnamed)
 
 
 @pytest.mark.parametrize("seed", [14, 18])

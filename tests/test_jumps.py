@@ -11,7 +11,7 @@ from jaxvm.discover.diagnose import _plain_fit
 from jaxvm.discover.jumps import with_jumps
 from jaxvm.discover.rivals import rivals
 from jaxvm.discover.score import ScoreTests
-from jaxvm.discover.select import refit, shortlist
+from jaxvm.discover.select import Weighing, refit, shortlist
 from jaxvm.discover.space import enumerate_hypotheses
 from jaxvm.physics.effects import Effect, Scope, Term
 from jaxvm.solve.snooping import robust_variance
@@ -33,7 +33,7 @@ def scored(course, seed=3):
     parts, plain, _ = _plain_fit(known.true_scene(recording), 3)
     tests = ScoreTests.of(plain, enumerate_hypotheses(plain.scene))
     ranking = tests.score(robust_variance(plain))
-    leading = shortlist(ranking, plain.scene, robust_variance(plain), parts.n, 12)
+    leading = shortlist(ranking, plain.scene, Weighing(robust_variance(plain), parts.n), 12)
     return truth, parts, plain, tests, ranking, leading
 
 
@@ -52,7 +52,7 @@ def loose():
 def test_three_jumps_lead_at_their_instants(loose):
     truth, parts, plain, tests, ranking, leading = loose
     assert not any(h.course.form == "3 jumps" for h, *_ in leading)
-    found = with_jumps(leading, tests, ranking, parts.n)
+    found = with_jumps(leading, tests, ranking, Weighing.at(plain, ranking, parts.n))
     assert [own for _, own, _ in found] == sorted((own for _, own, _ in found), reverse=True)
     named = [h for h, *_ in found if h.group.terms == LOOSE and "jumps" in h.course.form]
     assert named and named[0].entries[0].id == "principal-point-jump"
@@ -69,7 +69,7 @@ def test_three_jumps_lead_at_their_instants(loose):
 
 def test_rivals_of_jumps_are_what_else_may_jump(loose):
     _, parts, plain, tests, ranking, leading = loose
-    found = with_jumps(leading, tests, ranking, parts.n)
+    found = with_jumps(leading, tests, ranking, Weighing.at(plain, ranking, parts.n))
     hypothesis, _, amplitudes = next(
         item for item in found if item[0].group.terms == LOOSE and "jumps" in item[0].course.form
     )
@@ -88,7 +88,7 @@ def test_what_drifts_is_not_called_jumps():
         return Effect("it drifts", LOOSE, "time", "linear", (), 0.0, Scope(), (2e-2, 1.5e-2))
 
     _, parts, _, tests, ranking, leading = scored(drifting)
-    found = with_jumps(leading, tests, ranking, parts.n)
+    found = with_jumps(leading, tests, ranking, Weighing.at(plain, ranking, parts.n))
     assert found[0][0] is leading[0][0]
 
 
@@ -99,17 +99,17 @@ def test_what_sways_is_not_called_jumps(monkeypatch):
         return Effect("it sways", LOOSE, "time", "periodic", (period,), 0.0, Scope(), sizes)
 
     _, parts, _, tests, ranking, leading = scored(swaying)
-    assert with_jumps(leading, tests, ranking, parts.n) == leading
+    assert with_jumps(leading, tests, ranking, Weighing.at(plain, ranking, parts.n)) == leading
     # Four jumps explain much of it, and would be offered.
     monkeypatch.setattr("jaxvm.discover.jumps._by_a_curve", lambda *_: -np.inf)
-    offered = with_jumps(leading, tests, ranking, parts.n)
+    offered = with_jumps(leading, tests, ranking, Weighing.at(plain, ranking, parts.n))
     assert any(h.course.form == "4 jumps" and own > 100.0 for h, own, _ in offered)
 
 
 def test_a_curve_at_another_place_speaks_against_jumps(loose):
     """What one camera does at random is followed by four jumps of its station, too."""
     _, parts, _, tests, ranking, leading = loose
-    offered = with_jumps(leading, tests, ranking, parts.n)
+    offered = with_jumps(leading, tests, ranking, Weighing.at(plain, ranking, parts.n))
     scopes = {h.scope for h, *_ in offered if "jumps" in h.course.form}
     assert scopes
     raised = []
@@ -128,5 +128,5 @@ def test_a_curve_at_another_place_speaks_against_jumps(loose):
 def test_nothing_is_tried_where_no_step_explains_enough(loose, monkeypatch):
     _, parts, _, tests, ranking, leading = loose
     monkeypatch.setattr("jaxvm.discover.jumps._LEAST", 1.01)
-    assert with_jumps(leading, tests, ranking, parts.n) is leading
-    assert with_jumps([], tests, ranking, parts.n) == []
+    assert with_jumps(leading, tests, ranking, Weighing.at(plain, ranking, parts.n)) is leading
+    assert with_jumps([], tests, ranking, Weighing.at(plain, ranking, parts.n)) == []

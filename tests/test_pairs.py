@@ -11,7 +11,7 @@ from jaxvm.discover.diagnose import ROOM, _plain_fit
 from jaxvm.discover.hypotheses import FREE
 from jaxvm.discover.pairs import WIDE, better_pair, other_beginnings, worth_a_second_thought
 from jaxvm.discover.score import ScoreTests
-from jaxvm.discover.select import refit, shortlist
+from jaxvm.discover.select import Weighing, refit, shortlist
 from jaxvm.discover.space import enumerate_hypotheses
 from jaxvm.network.scene import build
 from jaxvm.network.start import start
@@ -46,7 +46,7 @@ def test_a_wide_name_gives_way_to_two_narrow_ones(two):
     parts, plain, tests = two
     variance = robust_variance(plain)
     ranking = tests.score(variance)
-    leading = shortlist(ranking, plain.scene, variance, parts.n, 60)
+    leading = shortlist(ranking, plain.scene, Weighing(variance, parts.n), 60)
     wide = next(item for item in leading if WIDE <= len(item[2]) <= FREE)
     one = refit(plain, wide[0], wide[2], parts)
     findings = [finding(plain, one)]

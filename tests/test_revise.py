@@ -15,12 +15,14 @@ from jaxvm.discover.revise import followed, follows, hidden, likelier, lost_with
 from jaxvm.discover.rivals import Rival
 from jaxvm.discover.score import ScoreTests
 from jaxvm.discover.space import enumerate_hypotheses
+from jaxvm.physics.catalogue import entries_for
 from jaxvm.physics.catalogue.entry import each
 from jaxvm.physics.effects import Effect, Scope, Term
 from jaxvm.solve.adjust import adjust
 
 N_EPOCHS = 24
-CAMERA = Scope(camera=("cam",))
+CAMERA, BOARD = Scope(camera=("cam",)), Scope(target=("board",))
+MARKS = each("mark", "target.point_z", numbers=range(30))
 AMOUNTS = each("epoch", "sensor.focal", numbers=range(N_EPOCHS))
 
 
@@ -192,3 +194,29 @@ def test_a_name_leads_as_soon_as_it_is_as_likely(drifting, weight, leads):
     # Of two names one must be clearly likelier.
     among = [replace(findings[0], hypothesis=named)]
     assert likelier(fit, among, 0, naming.parts.fit)[1] is among
+
+
+def test_amounts_of_all_marks_lead_when_they_are_likelier(known):
+    """Their spread belongs to them: without it they would fit what they can't know."""
+    depths = 2e-4 * np.random.default_rng(3).standard_normal(len(MARKS))
+    true = Effect("depths", MARKS, "constant", "constant", (), 0.0, BOARD, tuple(depths))
+    room, obs = (64, 8), known.recording.observations
+    pixel = predicted(known.true_scene().with_effects((true,), room))
+    pixel += obs.sigma[:, None] * np.random.default_rng(4).standard_normal(pixel.shape)
+    recording = replace(known.recording, observations=replace(obs, pixel=pixel))
+    parts, plain, _ = _plain_fit(known.true_scene(recording).with_effects((), room), 3)
+    entries = entries_for(MARKS, "target", ("constant",), "constant")
+    wide = Hypothesis(Group(MARKS, "target"), Course("constant", "constant"), BOARD, entries)
+    small = Effect("bow", (Term("target.bow_x"),), "constant", "constant", (), 0.0, BOARD, (0.0,))
+    fit = parts.fit(plain.scene.with_effects((small,), room))
+    finding = replace(told(small), rivals=(Rival(wide, 0.0, 0.9),), weight=0.1)
+    fitted, (found,) = likelier(fit, [finding], 0, parts.fit)
+    assert found.hypothesis is wide
+    spread = fitted.scene.effects[-1].spread
+    assert spread == pytest.approx(3.0 * np.median(np.abs(found.effect.amplitudes)), rel=0.2)
+    # But for a plane, which is a pose of the board.
+    points = known.recording.model.targets[0].points
+    plane = np.column_stack([np.ones(len(points)), points[:, :2]])
+    off = np.array(found.effect.amplitudes) - depths
+    off -= plane @ np.linalg.lstsq(plane, off, rcond=None)[0]
+    assert np.sqrt(np.mean(off**2)) < 0.3 * np.std(depths)

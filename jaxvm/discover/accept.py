@@ -100,7 +100,7 @@ def accept(
         for candidate in sorted(refitted, key=lambda c: -_common_evidence(c, refitted, current)):
             shown = split.evaluate(candidate.adjustment.scene)
             proof = gain(heldout, shown, seed)
-            strong = candidate.evidence > STRONG and len(candidate.amplitudes) <= FREE
+            strong = candidate.evidence > STRONG and _is_foretold(candidate)
             if ask_odds and strong and proof.share > 0.0 and not proof.proven:
                 after = replace(candidate.adjustment, scene=shown.scene)
                 proof = replace(proof, odds=split.odds(current, in_all(), after))
@@ -114,6 +114,14 @@ def accept(
                 return Accepted(candidate, others, shown, proof, tuple(tried))
             hopeless.add((identity(candidate.hypothesis), candidate.hypothesis.course))
     return short(leading[0][0])
+
+
+def _is_foretold(candidate: Candidate) -> bool:
+    """Whether the fitted epochs foretell the others: few columns, or the amounts of marks, of which
+    a name says how large they are. Amounts of epochs foretell none of another epoch.
+    """
+    amounts = any(term.driver == "epoch" for term in candidate.effect.terms)
+    return len(candidate.amplitudes) <= FREE or bool(candidate.hypothesis.entries and not amounts)
 
 
 def _is_determined(candidate: Candidate, shown: HeldOut) -> bool:

@@ -14,7 +14,7 @@ from jaxvm.discover.courses import ENDS, Course, gaps
 from jaxvm.discover.hypotheses import Family, Hypothesis
 from jaxvm.discover.ranking import Ranking, Scores, where
 from jaxvm.discover.score import ScoreTests
-from jaxvm.discover.select import SOUGHT, evidence
+from jaxvm.discover.select import SOUGHT, Weighing
 from jaxvm.discover.space import member
 from jaxvm.network.scene import Scene
 from jaxvm.physics.effects import Channels
@@ -36,19 +36,17 @@ _HALVES, _CONTACTS = 33, 9
 
 
 def at_finer_constants(
-    leading: Leading, tests: ScoreTests, ranking: Ranking, n: int
+    leading: Leading, tests: ScoreTests, ranking: Ranking, weigh: Weighing
 ) -> tuple[Leading, dict[tuple, Ranking]]:
     """The leading ones, with steps and stairs where they fit best on a finer grid.
 
-    And the scores of that grid, by what such a hypothesis says (`said`). `n` is the number of pixel
-    coordinates that are fitted.
+    And the scores of that grid, by what such a hypothesis says (`said`).
     """
     found, finer = [], {}
-    variance = ranking.scores[0].variance
     for hypothesis, own, amplitudes in leading:
-        about = scores_about(tests, ranking, hypothesis, variance)
+        about = scores_about(tests, ranking, hypothesis, weigh.variance)
         best = None if about is None else best_of(about.scores[0], hypothesis, tests)
-        better = -np.inf if best is None else evidence(*best, variance, n)
+        better = -np.inf if best is None else weigh(*best)
         # What is equal stays for its scores: they tell how wide the best one is.
         if best is not None and better >= own:
             (hypothesis, _, amplitudes), own = best, better

@@ -12,6 +12,7 @@ import numpy as np
 from jaxvm.discover.constants import constants_held, jumps_of, other_instants, run_away
 from jaxvm.network.scene import Scene
 from jaxvm.solve.adjust import Adjustment, adjust, reference_sigma
+from jaxvm.solve.covariance import amplitude_covariance
 
 CONFIRMED = 0.8
 """Bootstrap probability of an improvement on held-out epochs with which a finding is claimed."""
@@ -152,10 +153,14 @@ class Split:
             in_all: the model of `before` fitted to all epochs.
         """
         everything = self.undivided(after.scene)
-        gained = in_all.cost - everything.fit(after.scene).cost - (before.cost - after.cost)
-        own = after.scene.effects[len(before.scene.effects) :]
-        new = sum(effect.n_columns + len(effect.constants) for effect in own)
-        sharper = new * np.log(everything.n / self.n)
+        after_in_all = everything.fit(after.scene)
+        gained = in_all.cost - after_in_all.cost - (before.cost - after.cost)
+        own = after.scene.places()[len(before.scene.effects) :]
+        amplitudes = np.concatenate([np.arange(a.start, a.stop) for a, _ in own])
+        spreads = (amplitude_covariance(fit, amplitudes) for fit in (after, after_in_all))
+        (_, wide), (_, narrow) = map(np.linalg.slogdet, spreads)
+        constants = sum(c.stop - c.start for _, c in own)
+        sharper = wide - narrow + constants * np.log(everything.n / self.n)
         return float(2.0 * gained / after.variance_factor - sharper)
 
     def residuals(self, fitted: Adjustment) -> np.ndarray:

@@ -18,7 +18,7 @@ from jaxvm.discover.finer import Leading, best_of, of_courses
 from jaxvm.discover.hypotheses import FREE, Family, Hypothesis
 from jaxvm.discover.ranking import Ranking
 from jaxvm.discover.score import ScoreTests
-from jaxvm.discover.select import evidence
+from jaxvm.discover.select import Weighing
 from jaxvm.discover.space import member
 from jaxvm.network.scene import Scene
 from jaxvm.physics.forms import JUMPS, N_KNOTS
@@ -48,12 +48,12 @@ class _Place:
         return of_courses(self.family, self.index, tuple(courses))
 
 
-def with_jumps(leading: Leading, tests: ScoreTests, ranking: Ranking, n: int) -> Leading:
+def with_jumps(leading: Leading, tests: ScoreTests, ranking: Ranking, weigh: Weighing) -> Leading:
     """The leading hypotheses, and what jumps several times among them.
 
-    `ranking` are the scores of `tests`, `n` is the number of pixel coordinates that are fitted.
+    `ranking` are the scores of `tests`, and `weigh` is for these.
     """
-    variance = ranking.scores[0].variance
+    variance = weigh.variance
     least = _LEAST * leading[0][1] * variance if leading else np.inf
     places = sorted(_steps(ranking, tests.scene, least), key=lambda place: -place.drop)[:_MOST]
     if not places:
@@ -66,7 +66,7 @@ def with_jumps(leading: Leading, tests: ScoreTests, ranking: Ranking, n: int) ->
     for count in range(2, 1 + min(max(JUMPS), *map(len, every))):
         instants, found = _with_one_more(tests, variance, places, instants, every)
         for k, (hypothesis, drop, amplitudes) in enumerate(found):
-            own = evidence(hypothesis, drop, amplitudes, variance, n)
+            own = weigh(hypothesis, drop, amplitudes)
             beyond_noise = drop / variance - len(amplitudes) - count
             if beyond_noise > smooth[k] and (k not in best or own > best[k][1]):
                 best[k] = hypothesis, own, amplitudes

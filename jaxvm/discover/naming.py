@@ -15,7 +15,7 @@ from jaxvm.discover.hypotheses import FREE
 from jaxvm.discover.revise import given_effects, hidden, likelier, rename
 from jaxvm.discover.rivals import claim_of, rivals
 from jaxvm.discover.score import ScoreTests
-from jaxvm.discover.select import shortlist
+from jaxvm.discover.select import Weighing, shortlist
 from jaxvm.solve.adjust import Adjustment
 from jaxvm.solve.snooping import robust_variance
 
@@ -83,9 +83,9 @@ class Naming:
         if hidden(current, findings, k):
             return finding
         without, tests = self._without(current, findings, k)
-        variance = robust_variance(without)
-        ranking = tests.score(variance)
-        leading = shortlist(ranking, current.scene, variance, self.parts.n, _LEADING, FREE)
+        ranking = tests.score(robust_variance(without))
+        weigh = Weighing.at(without, ranking, self.parts.n)
+        leading = shortlist(ranking, current.scene, weigh, _LEADING, FREE)
         own = finding.hypothesis
         least = next((e for h, e, _ in leading if h.same(own)), -np.inf) - _BEHIND
         if own.entries:

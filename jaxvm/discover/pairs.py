@@ -13,7 +13,7 @@ from jaxvm.discover.hypotheses import FREE, Hypothesis
 from jaxvm.discover.ranking import Ranking
 from jaxvm.discover.revise import complexity
 from jaxvm.discover.score import ScoreTests
-from jaxvm.discover.select import DECIDED, Candidate, price, refit, shortlist, spread_of
+from jaxvm.discover.select import DECIDED, Candidate, Weighing, price, refit, shortlist, spread_of
 from jaxvm.physics.forms import JUMPS
 from jaxvm.solve.adjust import Adjustment
 from jaxvm.solve.snooping import robust_variance
@@ -68,8 +68,7 @@ def other_beginnings(ranking: Ranking, plain: Adjustment, found: Hypothesis, n: 
 
 def _narrow(ranking: Ranking, fit: Adjustment, n: int, count: int) -> list:
     """The leading hypotheses that have a name and few columns."""
-    variance = robust_variance(fit)
-    few = shortlist(ranking, fit.scene, variance, n, count, _NARROW)
+    few = shortlist(ranking, fit.scene, Weighing.at(fit, ranking, n), count, _NARROW)
     return [item for item in few if item[0].entries]
 
 

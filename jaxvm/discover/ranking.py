@@ -58,6 +58,11 @@ class Ranking:
         """Largest statistic."""
         return max((float(s.z[s.valid].max()) for s in self.scores if s.n), default=-np.inf)
 
+    def most(self, columns: int) -> float:
+        """Largest predicted drop of chi-square with at most so many columns."""
+        few = (s for s in self.scores if s.n and s.amplitude.shape[-1] <= columns)
+        return max((float(s.drop[s.valid].max()) for s in few), default=0.0)
+
     def left_at(self, ports: set[str], scope: Scope) -> float:
         """Probability that noise alone gives as much as is left at some ports of some bodies.
 

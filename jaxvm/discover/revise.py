@@ -13,7 +13,7 @@ from jaxvm.discover.constants import sensible
 from jaxvm.discover.diagnosis import Finding
 from jaxvm.discover.hypotheses import FREE, Hypothesis
 from jaxvm.discover.rivals import Rival
-from jaxvm.discover.select import price, price_of_columns, spread_of
+from jaxvm.discover.select import price, price_of_columns, spread_of, with_spread
 from jaxvm.network.scene import Scene
 from jaxvm.physics.effects import Effect, room_for
 from jaxvm.solve.adjust import Adjustment
@@ -154,7 +154,8 @@ def _better(
     # Even if it made all the others superfluous, it would have to come so far down.
     variance = current.variance_factor
     saved = 0.5 * variance * complexity(current, findings, variance, n)
-    tried = fit(scene.with_effects(tuple(effects), scene.room), wanted=current.cost + saved)
+    scene = with_spread(scene.with_effects(tuple(effects), scene.room), given + k, other, fit)
+    tried = fit(scene, wanted=current.cost + saved)
     if not (tried.converged and sensible(tried.scene, tried.scene.fitted_effects()[given + k])):
         return current, findings, k
     renamed = replace(findings[k], hypothesis=other, stds=(), rivals=(), weight=1.0)
@@ -188,11 +189,10 @@ def likelier(
     odds = _LIKELIER if finding.hypothesis.entries else 1.0
     if best is None or best.weight < odds * finding.weight:
         return current, findings
-    effects = list(scene.fitted_effects())
-    effects[given_effects(current, findings) + k] = best.hypothesis.effect(
-        np.zeros(best.hypothesis.n_columns)
-    )
-    tried = fit(scene.with_effects(tuple(effects), room_for(tuple(effects), scene.room)))
+    effects, place = list(scene.fitted_effects()), given_effects(current, findings) + k
+    effects[place] = best.hypothesis.effect(np.zeros(best.hypothesis.n_columns))
+    scene = scene.with_effects(tuple(effects), room_for(tuple(effects), scene.room))
+    tried = fit(with_spread(scene, place, best.hypothesis, fit))
     if not tried.converged:
         return current, findings
     before = Rival(finding.hypothesis, 0.0, finding.weight, finding.others)

@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 from jaxvm.discover.groups import Group
 from jaxvm.discover.hypotheses import Family, Hypothesis
 from jaxvm.discover.score import ScoreTests
-from jaxvm.discover.select import shortlist
+from jaxvm.discover.select import Weighing, shortlist
 from jaxvm.discover.space import families_of
 from jaxvm.network.scene import Scene
 from jaxvm.physics.catalogue import CATALOGUE
@@ -128,7 +128,7 @@ def of_each_image(
         return [], 1.0
     tests = tests.about(families_of_images(scene))
     ranking = tests.score(variance)
-    leading = shortlist(ranking, scene, variance, n, 12)
+    leading = shortlist(ranking, scene, Weighing(variance, n), 12)
     if not leading:
         return [], 1.0
     first, foremost, amplitudes = leading[0]
@@ -138,7 +138,7 @@ def of_each_image(
         again = (
             []
             if left is None
-            else shortlist(tests.score(variance, residual=left), scene, variance, n, 12)
+            else shortlist(tests.score(variance, residual=left), scene, Weighing(variance, n), 12)
         )
         if len(first.scope.camera) == 1 and _single(again, _ALSO * foremost):
             return [], 1.0

@@ -20,7 +20,7 @@ from jaxvm.discover.revise import lost_without, prune, with_effects
 from jaxvm.discover.rivals import rivals
 from jaxvm.discover.scatter import ALIKE, likeness, of_each_image
 from jaxvm.discover.score import ScoreTests
-from jaxvm.discover.select import Candidate, identity, refit, shortlist, stacked
+from jaxvm.discover.select import Candidate, Weighing, identity, refit, shortlist, stacked
 from jaxvm.discover.space import enumerate_hypotheses
 from jaxvm.discover.waves import strongest_wave
 from jaxvm.physics.forms import FORMS
@@ -65,6 +65,7 @@ class Search:
     p_value: float = 1.0
     unproven: str = ""
     ranking: Ranking = field(init=False)
+    _weigh: Weighing = field(init=False)
     _tests: ScoreTests = field(init=False)
     _signs: np.ndarray = field(init=False)
     _hopeless: set = field(default_factory=set)
@@ -109,11 +110,11 @@ class Search:
             if len(self.findings) == most or turns == _TURNS:
                 break
             leading, self._finer = at_finer_constants(
-                leading, self._tests, self.ranking, self.parts.n
+                leading, self._tests, self.ranking, self._weigh
             )
             leading = with_slow_beginnings(leading, self.ranking, self.current.scene)
             if self.p_value <= self.alpha:
-                leading = with_jumps(leading, self._tests, self.ranking, self.parts.n)
+                leading = with_jumps(leading, self._tests, self.ranking, self._weigh)
             accepted = self._accepted(leading, progress)
             scored = self.p_value
             # What no course explains may be a wave, or differ from image to image.
@@ -140,7 +141,8 @@ class Search:
         variance = robust_variance(current)
         self._tests = self._tests.at(current)
         self.ranking = self._tests.score(variance, self._signs)
-        foremost = shortlist(self.ranking, current.scene, variance, self.parts.n, 12)
+        self._weigh = Weighing.at(current, self.ranking, self.parts.n)
+        foremost = shortlist(self.ranking, current.scene, self._weigh, 12)
         self.p_value = self.ranking.p_value(self.ranking.best_z())
         if self.p_value > self.alpha and foremost:
             self.p_value = self._p_without(*foremost[0][::2])

@@ -5,6 +5,7 @@ The evidence is on the scale of chi-square (twice the log of a posterior weight,
     E = drop / variance - columns ln n + 2 ln prior.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -56,8 +57,42 @@ A time constant that is off by a factor of e leaves about a tenth of an effect u
 _MIMICRY = 0.1
 """Weight of a named free form: it can mimic much that has another name, or none."""
 
+_QUIETEST = 0.01
+"""Share of the variance that is left at least when the best hypothesis is taken out."""
+
 UNNAMED_PRIOR = 0.01
 """Weight of a hypothesis that no engineer has a name for, against one of the catalogue."""
+
+
+@dataclass(frozen=True)
+class Weighing:
+    """Evidence that is foretold of hypotheses, before any of them is refitted.
+
+    Attributes:
+        variance: of unit weight, of the residuals without any of them.
+        n: number of pixel coordinates that are fitted.
+        quiet: what `variance` will be with the best hypothesis of few columns; None: the same.
+            What is large is noise to itself. Beside it one column more or less is cheap, and is not
+            when that noise is gone: hypotheses of few columns pay for them and their constants in
+            the noise that will be left. One of many columns takes some of it for itself, and pays
+            in full.
+    """
+
+    variance: float
+    n: int
+    quiet: float | None = None
+
+    def __call__(self, hypothesis: Hypothesis, drop: float, amplitudes: np.ndarray) -> float:
+        narrow = self.quiet is not None and len(amplitudes) <= FREE
+        noise = self.quiet if narrow else self.variance
+        return noise / self.variance * evidence(hypothesis, drop, amplitudes, noise, self.n)
+
+    @classmethod
+    def at(cls, fit: Adjustment, ranking: Ranking, n: int) -> "Weighing":
+        """For the scores of all hypotheses at a fit."""
+        variance = ranking.scores[0].variance
+        left = (2.0 * fit.cost - ranking.most(FREE)) / fit.degrees_of_freedom
+        return cls(variance, n, min(variance, max(left, _QUIETEST * variance)))
 
 
 @dataclass(frozen=True)
@@ -191,7 +226,7 @@ def identity(hypothesis: Hypothesis) -> tuple:
 
 
 def shortlist(
-    ranking: Ranking, scene: Scene, variance: float, n: int, count: int, columns: int | None = None
+    ranking: Ranking, scene: Scene, weigh: Weighing, count: int, columns: int | None = None
 ):
     """The best hypotheses by evidence, one for each physics, place and kind of course.
 
@@ -201,7 +236,7 @@ def shortlist(
     seen: dict[tuple, float] = {}
     chosen, behind = [], 0
     weighed = [
-        (hypothesis, evidence(hypothesis, drop, amplitudes, variance, n), amplitudes)
+        (hypothesis, weigh(hypothesis, drop, amplitudes), amplitudes)
         for hypothesis, drop, amplitudes in top(ranking, scene, 400, columns)
     ]
     for hypothesis, own, amplitudes in sorted(weighed, key=lambda item: -item[1]):
@@ -248,14 +283,7 @@ def refit(base: Adjustment, hypothesis: Hypothesis, amplitudes, split: Split) ->
             check=False,
         )
 
-    if len(amplitudes) > FREE:
-        # What some tiles or knots can't know, the others tell: their spread (empirical Bayes). What
-        # has a name begins with the spread that its name foresees: with none at all, what is nearly
-        # another pose would grow until it mimics something else.
-        middles = [float(np.sqrt(np.prod(entry.plausible))) for entry in hypothesis.entries]
-        scene = _with_spread(scene, min(middles)) if middles else scene
-        own = np.asarray(fit(scene).scene.fitted_effects()[-1].amplitudes)
-        scene = _with_spread(scene, float(np.median(np.abs(own))))
+    scene = with_spread(scene, -1, hypothesis, fit)
     # At amplitude zero nothing shows what a constant does: it is freed at the amplitudes.
     fitted = fit(scene)
     if effects[-1].constants and not fitted.failed:
@@ -278,10 +306,27 @@ def refit(base: Adjustment, hypothesis: Hypothesis, amplitudes, split: Split) ->
     return Candidate(named, fitted, own)
 
 
-def _with_spread(scene: Scene, size: float) -> Scene:
-    """The scene with the prior of the last effect's amplitudes as wide as their size says."""
-    *others, last = scene.effects
-    return scene.with_effects((*others, replace(last, spread=_WIDE * size)), scene.room)
+def with_spread(
+    scene: Scene, place: int, hypothesis: Hypothesis, fit: Callable[[Scene], Adjustment]
+) -> Scene:
+    """The scene with the prior of an effect's amplitudes as wide as their size says, if it is wide.
+
+    What some tiles or knots can't know, the others tell: their spread (empirical Bayes). What has a
+    name begins with the spread that its name foresees: with none at all, what is nearly another
+    pose would grow until it mimics something else.
+    """
+    if hypothesis.n_columns <= FREE:
+        return scene
+
+    def spread(size: float) -> Scene:
+        effects = list(scene.effects)
+        effects[place] = replace(effects[place], spread=_WIDE * size)
+        return scene.with_effects(tuple(effects), scene.room)
+
+    middles = [float(np.sqrt(np.prod(entry.plausible))) for entry in hypothesis.entries]
+    first = fit(spread(min(middles)) if middles else scene)
+    own = np.asarray(first.scene.fitted_effects()[place].amplitudes)
+    return spread(float(np.median(np.abs(own))))
 
 
 def stacked(adjustment: Adjustment) -> np.ndarray:
