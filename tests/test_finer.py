@@ -201,14 +201,14 @@ def test_constants_are_found_between_points_of_the_grid(form, constants, terms, 
     scene = with_hidden(form, constants, terms, amplitudes, scope)
     parts, plain, _ = _plain_fit(scene, 3)
     tests = ScoreTests.of(plain, enumerate_hypotheses(plain.scene))
-    variance = robust_variance(plain)
-    ranking = tests.score(variance)
-    leading = shortlist(ranking, plain.scene, Weighing(variance, parts.n), 12)
+    ranking = tests.score(robust_variance(plain))
+    weigh = Weighing.at(plain, ranking, parts.n)
+    leading = shortlist(ranking, plain.scene, weigh, 12)
     own = next(
         item for item in leading
         if (item[0].course.form, item[0].group.terms, item[0].scope) == (form, terms, scope)
     )  # fmt: skip
-    finer, about = at_finer_constants(leading, tests, ranking, Weighing.at(plain, ranking, parts.n))
+    finer, about = at_finer_constants(leading, tests, ranking, weigh)
     best = next(item for item in finer if item[0].group.terms == terms and item[0].scope == scope)
     assert best[0].course.form == form
     assert best[1] > own[1] + 5.0

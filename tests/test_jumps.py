@@ -33,7 +33,7 @@ def scored(course, seed=3):
     parts, plain, _ = _plain_fit(known.true_scene(recording), 3)
     tests = ScoreTests.of(plain, enumerate_hypotheses(plain.scene))
     ranking = tests.score(robust_variance(plain))
-    leading = shortlist(ranking, plain.scene, Weighing(robust_variance(plain), parts.n), 12)
+    leading = shortlist(ranking, plain.scene, Weighing.at(plain, ranking, parts.n), 12)
     return truth, parts, plain, tests, ranking, leading
 
 
@@ -87,7 +87,7 @@ def test_what_drifts_is_not_called_jumps():
     def drifting(middles):
         return Effect("it drifts", LOOSE, "time", "linear", (), 0.0, Scope(), (2e-2, 1.5e-2))
 
-    _, parts, _, tests, ranking, leading = scored(drifting)
+    _, parts, plain, tests, ranking, leading = scored(drifting)
     found = with_jumps(leading, tests, ranking, Weighing.at(plain, ranking, parts.n))
     assert found[0][0] is leading[0][0]
 
@@ -98,7 +98,7 @@ def test_what_sways_is_not_called_jumps(monkeypatch):
         sizes = (2.0, 3.0, -2.5, 1.5)  # px, sine and cosine
         return Effect("it sways", LOOSE, "time", "periodic", (period,), 0.0, Scope(), sizes)
 
-    _, parts, _, tests, ranking, leading = scored(swaying)
+    _, parts, plain, tests, ranking, leading = scored(swaying)
     assert with_jumps(leading, tests, ranking, Weighing.at(plain, ranking, parts.n)) == leading
     # Four jumps explain much of it, and would be offered.
     monkeypatch.setattr("jaxvm.discover.jumps._by_a_curve", lambda *_: -np.inf)
@@ -108,7 +108,7 @@ def test_what_sways_is_not_called_jumps(monkeypatch):
 
 def test_a_curve_at_another_place_speaks_against_jumps(loose):
     """What one camera does at random is followed by four jumps of its station, too."""
-    _, parts, _, tests, ranking, leading = loose
+    _, parts, plain, tests, ranking, leading = loose
     offered = with_jumps(leading, tests, ranking, Weighing.at(plain, ranking, parts.n))
     scopes = {h.scope for h, *_ in offered if "jumps" in h.course.form}
     assert scopes
@@ -122,11 +122,11 @@ def test_a_curve_at_another_place_speaks_against_jumps(loose):
                         drop[:, places, s] = 1e9
         raised.append(replace(own, drop=drop))
     other = replace(ranking, scores=tuple(raised))
-    assert with_jumps(leading, tests, other, parts.n) == leading
+    assert with_jumps(leading, tests, other, Weighing.at(plain, other, parts.n)) == leading
 
 
 def test_nothing_is_tried_where_no_step_explains_enough(loose, monkeypatch):
-    _, parts, _, tests, ranking, leading = loose
+    _, parts, plain, tests, ranking, leading = loose
     monkeypatch.setattr("jaxvm.discover.jumps._LEAST", 1.01)
     assert with_jumps(leading, tests, ranking, Weighing.at(plain, ranking, parts.n)) is leading
     assert with_jumps([], tests, ranking, Weighing.at(plain, ranking, parts.n)) == []
