@@ -83,8 +83,9 @@ class Weighing:
     quiet: float | None = None
 
     def __call__(self, hypothesis: Hypothesis, drop: float, amplitudes: np.ndarray) -> float:
-        narrow = self.quiet is not None and len(amplitudes) <= FREE
-        noise = self.quiet if narrow else self.variance
+        noise = self.variance
+        if self.quiet is not None and len(amplitudes) <= FREE:
+            noise = self.quiet
         return noise / self.variance * evidence(hypothesis, drop, amplitudes, noise, self.n)
 
     @classmethod
