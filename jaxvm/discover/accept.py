@@ -117,8 +117,9 @@ def accept(
 
 
 def _is_foretold(candidate: Candidate) -> bool:
-    """Whether the fitted epochs foretell the others: few columns, or the amounts of marks, of which
-    a name says how large they are. Amounts of epochs foretell none of another epoch.
+    """Whether fitted epochs foretell others: the amount of an epoch foretells none of another.
+
+    Few columns do, and the amounts of marks, of which a name says how large they are.
     """
     amounts = any(term.driver == "epoch" for term in candidate.effect.terms)
     return len(candidate.amplitudes) <= FREE or bool(candidate.hypothesis.entries and not amounts)
