@@ -33,8 +33,9 @@ def scored(course, seed=3):
     parts, plain, _ = _plain_fit(known.true_scene(recording), 3)
     tests = ScoreTests.of(plain, enumerate_hypotheses(plain.scene))
     ranking = tests.score(robust_variance(plain))
-    leading = shortlist(ranking, plain.scene, Weighing.at(plain, ranking, parts.n), 12)
-    return truth, parts, plain, tests, ranking, leading
+    weigh = Weighing.at(plain, ranking, parts.n)
+    leading = shortlist(ranking, plain.scene, weigh, 12)
+    return truth, parts, plain, tests, ranking, weigh, leading
 
 
 def knocked(middles):
@@ -50,9 +51,9 @@ def loose():
 
 
 def test_three_jumps_lead_at_their_instants(loose):
-    truth, parts, plain, tests, ranking, leading = loose
+    truth, parts, plain, tests, ranking, weigh, leading = loose
     assert not any(h.course.form == "3 jumps" for h, *_ in leading)
-    found = with_jumps(leading, tests, ranking, Weighing.at(plain, ranking, parts.n))
+    found = with_jumps(leading, tests, ranking, weigh)
     assert [own for _, own, _ in found] == sorted((own for _, own, _ in found), reverse=True)
     named = [h for h, *_ in found if h.group.terms == LOOSE and "jumps" in h.course.form]
     assert named and named[0].entries[0].id == "principal-point-jump"
@@ -68,8 +69,8 @@ def test_three_jumps_lead_at_their_instants(loose):
 
 
 def test_rivals_of_jumps_are_what_else_may_jump(loose):
-    _, parts, plain, tests, ranking, leading = loose
-    found = with_jumps(leading, tests, ranking, Weighing.at(plain, ranking, parts.n))
+    _, parts, plain, tests, ranking, weigh, leading = loose
+    found = with_jumps(leading, tests, ranking, weigh)
     hypothesis, _, amplitudes = next(
         item for item in found if item[0].group.terms == LOOSE and "jumps" in item[0].course.form
     )
@@ -87,8 +88,8 @@ def test_what_drifts_is_not_called_jumps():
     def drifting(middles):
         return Effect("it drifts", LOOSE, "time", "linear", (), 0.0, Scope(), (2e-2, 1.5e-2))
 
-    _, parts, plain, tests, ranking, leading = scored(drifting)
-    found = with_jumps(leading, tests, ranking, Weighing.at(plain, ranking, parts.n))
+    *_, tests, ranking, weigh, leading = scored(drifting)
+    found = with_jumps(leading, tests, ranking, weigh)
     assert found[0][0] is leading[0][0]
 
 
@@ -98,18 +99,18 @@ def test_what_sways_is_not_called_jumps(monkeypatch):
         sizes = (2.0, 3.0, -2.5, 1.5)  # px, sine and cosine
         return Effect("it sways", LOOSE, "time", "periodic", (period,), 0.0, Scope(), sizes)
 
-    _, parts, plain, tests, ranking, leading = scored(swaying)
-    assert with_jumps(leading, tests, ranking, Weighing.at(plain, ranking, parts.n)) == leading
+    *_, tests, ranking, weigh, leading = scored(swaying)
+    assert with_jumps(leading, tests, ranking, weigh) == leading
     # Four jumps explain much of it, and would be offered.
     monkeypatch.setattr("jaxvm.discover.jumps._by_a_curve", lambda *_: -np.inf)
-    offered = with_jumps(leading, tests, ranking, Weighing.at(plain, ranking, parts.n))
+    offered = with_jumps(leading, tests, ranking, weigh)
     assert any(h.course.form == "4 jumps" and own > 100.0 for h, own, _ in offered)
 
 
 def test_a_curve_at_another_place_speaks_against_jumps(loose):
     """What one camera does at random is followed by four jumps of its station, too."""
-    _, parts, plain, tests, ranking, leading = loose
-    offered = with_jumps(leading, tests, ranking, Weighing.at(plain, ranking, parts.n))
+    *_, tests, ranking, weigh, leading = loose
+    offered = with_jumps(leading, tests, ranking, weigh)
     scopes = {h.scope for h, *_ in offered if "jumps" in h.course.form}
     assert scopes
     raised = []
@@ -122,11 +123,11 @@ def test_a_curve_at_another_place_speaks_against_jumps(loose):
                         drop[:, places, s] = 1e9
         raised.append(replace(own, drop=drop))
     other = replace(ranking, scores=tuple(raised))
-    assert with_jumps(leading, tests, other, Weighing.at(plain, other, parts.n)) == leading
+    assert with_jumps(leading, tests, other, weigh) == leading
 
 
 def test_nothing_is_tried_where_no_step_explains_enough(loose, monkeypatch):
-    _, parts, plain, tests, ranking, leading = loose
+    *_, tests, ranking, weigh, leading = loose
     monkeypatch.setattr("jaxvm.discover.jumps._LEAST", 1.01)
-    assert with_jumps(leading, tests, ranking, Weighing.at(plain, ranking, parts.n)) is leading
-    assert with_jumps([], tests, ranking, Weighing.at(plain, ranking, parts.n)) == []
+    assert with_jumps(leading, tests, ranking, weigh) is leading
+    assert with_jumps([], tests, ranking, weigh) == []

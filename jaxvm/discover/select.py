@@ -71,7 +71,7 @@ class Weighing:
     Attributes:
         variance: of unit weight, of the residuals without any of them.
         n: number of pixel coordinates that are fitted.
-        quiet: what `variance` will be with the best hypothesis of few columns; None: the same.
+        quiet: what `variance` will be with the best hypothesis of few columns.
             What is large is noise to itself. Beside it one column more or less is cheap, and is not
             when that noise is gone: hypotheses of few columns pay for them and their constants in
             the noise that will be left. One of many columns takes some of it for itself, and pays
@@ -80,12 +80,10 @@ class Weighing:
 
     variance: float
     n: int
-    quiet: float | None = None
+    quiet: float = np.inf
 
     def __call__(self, hypothesis: Hypothesis, drop: float, amplitudes: np.ndarray) -> float:
-        noise = self.variance
-        if self.quiet is not None and len(amplitudes) <= FREE:
-            noise = self.quiet
+        noise = min(self.quiet, self.variance) if len(amplitudes) <= FREE else self.variance
         return noise / self.variance * evidence(hypothesis, drop, amplitudes, noise, self.n)
 
     @classmethod
@@ -93,7 +91,7 @@ class Weighing:
         """For the scores of all hypotheses at a fit."""
         variance = ranking.scores[0].variance
         left = (2.0 * fit.cost - ranking.most(FREE)) / fit.degrees_of_freedom
-        return cls(variance, n, min(variance, max(left, _QUIETEST * variance)))
+        return cls(variance, n, max(left, _QUIETEST * variance))
 
 
 @dataclass(frozen=True)
