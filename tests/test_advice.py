@@ -10,7 +10,13 @@ import pytest
 from networks import HELD, IMAGE, at_values, predicted, stereo_recording
 from scipy.spatial.transform import Rotation
 
-from jaxvm.discover.advice import _batches, _chances, _information, advise
+from jaxvm.discover.advice import (
+    _batches,
+    _chances,
+    _information,
+    _without_priors,
+    advise,
+)
 from jaxvm.discover.courses import Course
 from jaxvm.discover.groups import Group
 from jaxvm.discover.hypotheses import Hypothesis
@@ -133,7 +139,8 @@ def test_the_predicted_gap_is_the_difference_of_refits(stereo, driver, amplitude
     further = planned(PLAN["farther"], stereo, another_day=True)
     (batch,) = _batches(stereo, 0, as_rivals(wrong), ())
     present = _information(batch.scene, ones(stereo))
-    both = present + _information(batch.under(further.scene), further.weights)
+    planned_scene = _without_priors(batch.under(further.scene))
+    both = present + _information(planned_scene, further.weights)
     (gap,) = batch.gaps(both, batch.mimics(present))
     (promised,) = advice.gaps
     if driver == "time":
@@ -304,6 +311,30 @@ def test_a_pair_that_distance_does_not_part(frontal):
         assert advice.gaps[0] < 1e-3 and not advice.decides
 
 
+def moved(key: str, *by: float) -> Plan:
+    return Plan(key, key, poses=lambda poses, middles, eye, up: poses + np.array(by))
+
+
+def test_what_is_known_beforehand_counts_once(frontal):
+    """Nothing is seen under either plan; under the second, marks are next to the camera's plane.
+
+    How large an amplitude may be at most goes by the marks, and there its pattern has no bound.
+    """
+    course = Course("constant", "constant", (), 0.0)
+    over_the_image = Hypothesis(
+        Group((Term("sensor.focal", driver="radius"),), "camera"), course, Scope(), ()
+    )
+    scene = frontal.with_effects((over_the_image.effect((AMPLITUDE,)),), ROOM)
+    plans = (
+        moved("behind", 0, 0, 0, 0, 0, -2.0 * DISTANCE),
+        moved("beside", 0, 0, 0, 5.0, 0, 1e-9 - DISTANCE),
+    )
+    twin = rival("lens.k1", "constant", "constant")
+    behind, beside = advise(scene, ones(scene), 0, as_rivals(twin), 1.0, plans)
+    assert behind.gaps[0] > 0.0
+    assert beside.gaps[0] == pytest.approx(behind.gaps[0], rel=1e-6)
+
+
 # --- plans ----------------------------------------------------------------------------------------
 
 
@@ -397,6 +428,26 @@ def test_marks_behind_the_camera_have_no_weight(frontal):
     behind = [0.0, 0.0, 0.0, 0.0, 0.0, -2.0 * DISTANCE]
     _, weight = seen_by(frontal, lambda poses, middles, eye, up: poses + behind)
     assert not weight.any()
+
+
+def test_a_tilted_plate_does_not_reach_through_the_camera(frontal):
+    """Its middle is at an eighth of the distance: the near half is nearer than anything was."""
+    inside, weight = seen_by(
+        frontal, lambda poses, middles, eye, up: poses + [0, 1.2, 0, 0, 0, 0.25 - DISTANCE]
+    )
+    assert inside.any() and not weight.any()
+
+
+def test_a_lens_does_not_fold_what_is_far_outside_into_the_image(frontal):
+    """Barrel distortion turns back at r^2 = 1 / (3 k): what is beyond is predicted inside again."""
+    (camera,) = frontal.model.cameras
+    barrel = replace(camera, lens="opencv5", distortion=np.array([-0.3, 0.0, 0.0, 0.0, 0.0]))
+    model = replace(frontal.model, cameras=(barrel,))
+    scene = build(replace(frontal.recording, model=model))
+    inside, weight = seen_by(scene, lambda poses, middles, eye, up: poses + [0, 0, 0, 3.0, 0, 0])
+    assert inside.all() and not weight.any()
+    inside, weight = seen_by(scene, lambda poses, middles, eye, up: poses)
+    assert inside.all() and weight.all()
 
 
 @pytest.mark.parametrize("key", ["tilt", "field"])

@@ -18,7 +18,7 @@ finding is right, l - d where the rival is.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain, count, islice
 
 import equinox as eqx
@@ -131,7 +131,7 @@ def advise(
         for another_day in days:
             further = planned(plan, scene, another_day)
             both = [
-                known + _information(batch.under(further.scene), further.weights)
+                known + _information(_without_priors(batch.under(further.scene)), further.weights)
                 for batch, known in zip(batches, present, strict=True)
             ]
             expected = np.minimum(expected, gaps(both))
@@ -280,6 +280,19 @@ def _chances(log_odds: np.ndarray, gain: np.ndarray, needed: float) -> np.ndarra
     own = 1.0 / (1.0 + np.exp(-0.5 * log_odds))
     right, wrong = (ndtr((s * log_odds + gain - needed) / spread) for s in (1.0, -1.0))
     return own * right + (1.0 - own) * wrong
+
+
+def _without_priors(scene: Scene) -> Scene:
+    """The scene without what is known beforehand: that counts once, with the first recording.
+
+    How large an amplitude may be goes by the places of all marks, too, and those that a plan brings
+    out of sight may be anywhere.
+    """
+    priors = scene.network.priors
+    if priors is None:
+        return scene
+    nothing = replace(priors, weight=jnp.zeros_like(priors.weight))
+    return replace(scene, network=replace(scene.network, priors=nothing))
 
 
 def _information(scene: Scene, weights: tuple[np.ndarray, ...]) -> np.ndarray:

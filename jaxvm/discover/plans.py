@@ -13,11 +13,19 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from jaxvm.geometry.lenses import lens_family
 from jaxvm.network.residual import predict_pixels
 from jaxvm.network.scene import Scene, build
+from jaxvm.network.views import rays_of_pixels
 from jaxvm.physics.drivers import air_and_bodies, channel_kind
 from jaxvm.recording import Drivers, Recording
 from jaxvm.recording.join import PAUSE_S
+
+_SAME_RAY_RAD = 0.02
+"""Angle within which the ray of a pixel leads to its mark: far more than an effect turns it."""
+
+_NEAREST = 0.45
+"""Depth to which a plan may bring a mark, over that of the nearest one in the recording."""
 
 
 @dataclass(frozen=True)
@@ -238,15 +246,11 @@ def planned(plan: Plan, scene: Scene, another_day: bool = False) -> Planned:
     if another_day:
         changed = _on_another_day(changed)
     changed = changed.with_effects(scene.fitted_effects(), scene.room)
-    sizes = np.array([c.image_size for c in scene.model.cameras], float)
-    camera = recording.observations.camera
-    weights = []
-    for rows, pixels in zip(
-        changed.tables, predict_pixels(changed.state, changed.network), strict=True
-    ):
-        own = np.asarray(pixels)[: len(rows)]
-        inside = (own > 0.0) & (own < sizes[camera[rows]] - 1.0)
-        weights.append((inside.all(axis=1) & _in_front(changed, rows)).astype(float))
+    tables = zip(changed.tables, predict_pixels(changed.state, changed.network), strict=True)
+    weights = [
+        _seen(changed, rows, np.asarray(pixels)[: len(rows)], _nearest(scene)).astype(float)
+        for rows, pixels in tables
+    ]
     return Planned(changed, tuple(weights))
 
 
@@ -287,8 +291,41 @@ def _with_poses(plan: Plan, scene: Scene):
     return eqx.tree_at(lambda s: s.carrier_from_target, scene.state, jnp.asarray(table))
 
 
-def _in_front(scene: Scene, rows: np.ndarray) -> np.ndarray:
-    """Whether the marks of observations are in front of their cameras."""
+def _nearest(scene: Scene) -> float:
+    """Least depth of a mark that a plan may bring about (m).
+
+    A tilted board whose middle is at half the distance would reach through the camera, and there
+    everything tells itself from everything.
+    """
+    depths = [_in_camera(scene, rows)[:, 2] for rows in scene.tables if len(rows)]
+    return _NEAREST * float(min(map(np.min, depths), default=0.0))
+
+
+def _seen(scene: Scene, rows: np.ndarray, pixels: np.ndarray, nearest: float) -> np.ndarray:
+    """Whether the marks of observations (one family of lenses) are seen at predicted pixels.
+
+    They are inside the image, no nearer to the camera than a plan may bring them, and the lens
+    leads back from the pixel to the mark: beyond its field a polynomial folds what is far outside
+    back into the image.
+    """
+    camera = scene.recording.observations.camera[rows]
+    if not len(camera):
+        return np.zeros(0, bool)
+    sizes = np.array([c.image_size for c in scene.model.cameras], float)[camera]
+    inside = ((pixels > 0.0) & (pixels < sizes - 1.0)).all(axis=1)
+    marks = _in_camera(scene, rows)
+    lens = (
+        np.asarray(table)[camera]
+        for table in (scene.state.focal, scene.state.centre, scene.state.distortion)
+    )
+    family = lens_family(scene.model.cameras[camera[0]].lens)
+    back = rays_of_pixels(family, *lens, np.where(inside[:, None], pixels, 0.0))
+    cosine = np.sum(_unit(back) * _unit(marks), axis=1)
+    return inside & (marks[:, 2] > max(nearest, 0.0)) & (cosine > np.cos(_SAME_RAY_RAD))
+
+
+def _in_camera(scene: Scene, rows: np.ndarray) -> np.ndarray:
+    """Marks of observations in camera coordinates (m)."""
     obs, state = scene.recording.observations, scene.state
     names = [s.name for s in scene.model.stations]
     station = np.array([names.index(c.station) for c in scene.model.cameras])
@@ -304,4 +341,4 @@ def _in_front(scene: Scene, rows: np.ndarray) -> np.ndarray:
             point = turn.apply(point) + pose[:, 3:]
         else:
             point = turn.inv().apply(point - pose[:, 3:])
-    return point[:, 2] > 0.0
+    return point
