@@ -85,10 +85,13 @@ def _(site):
     way = site.way()
     course = courses.constant()
 
-    def field(view, xy):
-        return xy * (xy @ way)[:, None]
+    def hooks(size):
+        def hook(view, image):
+            slope = size * course.at(view) * acts.cameras_mask(view, site.cameras)
+            return image / (1.0 - slope * (image @ way))[:, None]
 
-    hooks = acts.on_image(site.cameras, field, course)
+        return {"lens": hook}
+
     return site.draft(hooks, 5e-5, 5e-3, course, {})
 
 
