@@ -7,6 +7,7 @@ what the plan would decide is computed from its geometry alone.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -297,8 +298,9 @@ def _nearest(scene: Scene) -> float:
     A tilted board whose middle is at half the distance would reach through the camera, and there
     everything tells itself from everything.
     """
-    depths = [_in_camera(scene, rows)[:, 2] for rows in scene.tables if len(rows)]
-    return _NEAREST * float(min(map(np.min, depths), default=0.0))
+    depths = [_in_camera(scene, rows)[:, 2] for rows in scene.tables]
+    seen = [depth[depth > 0.0] for depth in depths if (depth > 0.0).any()]
+    return _NEAREST * float(min(map(np.min, seen), default=0.0))
 
 
 def _seen(scene: Scene, rows: np.ndarray, pixels: np.ndarray, nearest: float) -> np.ndarray:
@@ -311,17 +313,17 @@ def _seen(scene: Scene, rows: np.ndarray, pixels: np.ndarray, nearest: float) ->
     camera = scene.recording.observations.camera[rows]
     if not len(camera):
         return np.zeros(0, bool)
-    sizes = np.array([c.image_size for c in scene.model.cameras], float)[camera]
-    inside = ((pixels > 0.0) & (pixels < sizes - 1.0)).all(axis=1)
+    cameras, state = scene.model.cameras, scene.state
+    sizes = np.array([c.image_size for c in cameras], float)[camera]
+    inside: Any = np.all((pixels > 0.0) & (pixels < sizes - 1.0), axis=1)
     marks = _in_camera(scene, rows)
-    lens = (
-        np.asarray(table)[camera]
-        for table in (scene.state.focal, scene.state.centre, scene.state.distortion)
+    focal, centre, distortion = (
+        np.asarray(v)[camera] for v in (state.focal, state.centre, state.distortion)
     )
-    family = lens_family(scene.model.cameras[camera[0]].lens)
-    back = rays_of_pixels(family, *lens, np.where(inside[:, None], pixels, 0.0))
+    where = np.where(inside[:, None], pixels, 0.0)
+    back = rays_of_pixels(lens_family(cameras[camera[0]].lens), focal, centre, distortion, where)
     cosine = np.sum(_unit(back) * _unit(marks), axis=1)
-    return inside & (marks[:, 2] > max(nearest, 0.0)) & (cosine > np.cos(_SAME_RAY_RAD))
+    return inside & (marks[:, 2] > nearest) & (cosine > np.cos(_SAME_RAY_RAD))
 
 
 def _in_camera(scene: Scene, rows: np.ndarray) -> np.ndarray:
