@@ -1,6 +1,7 @@
 """The harness itself: the projection, the names, the places, the intervals."""
 
 import json
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -10,7 +11,8 @@ from names import Facts, same_name, same_place
 from power import facts_of, plain_fit, shown, whitened
 from scipy.integrate import solve_ivp
 from tally import odds_of_noise, wilson
-from world import heat
+from world import EFFECTS, heat
+from world.effect import Site
 
 from jaxvm.discover.cells import arrange
 from jaxvm.recording import read_recording
@@ -267,3 +269,24 @@ def test_lags_of_the_world_are_the_differential_equation(tau):
         max_step=2.0, rtol=1e-9, atol=1e-11,
     )  # fmt: skip
     np.testing.assert_allclose(heat.lagged(x, tau), exact.y[0], atol=2e-6)
+
+
+def test_a_tilted_sensor_keeps_lines_straight_and_bends_their_scale():
+    """A homography: points of a line stay on one, and their cross ratio stays what it was."""
+    scene = SimpleNamespace(kind="wide", cameras=[SimpleNamespace(name="camera")])
+    site = Site(scene, np.random.default_rng(4), [0], 0, 0, 0)
+    hook = EFFECTS["sensor-tilted"].draw(site).hooks(0.05)["lens"]
+    at = np.array([-0.9, -0.2, 0.4, 1.1])
+    line = np.array([0.1, -0.3]) + at[:, None] * [0.8, 0.6]
+    view = SimpleNamespace(rows=SimpleNamespace(camera=np.zeros(4, int)), t=np.zeros(4))
+    moved = hook(view, line)
+    assert np.abs(moved - line).max() > 0.02
+    way = moved[-1] - moved[0]
+    along = (moved - moved[0]) @ way / (way @ way)
+    np.testing.assert_allclose(moved, moved[0] + along[:, None] * way, atol=1e-12)
+
+    def cross_ratio(a, b, c, d):
+        return (c - a) * (d - b) / ((c - b) * (d - a))
+
+    assert cross_ratio(*along) == pytest.approx(cross_ratio(*at), rel=1e-12)
+    assert abs((along[2] - along[1]) - (at[2] - at[1]) / (at[3] - at[0])) > 1e-3
