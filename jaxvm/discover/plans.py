@@ -224,7 +224,7 @@ def possible(plan: Plan, recording: Recording) -> bool:
 def planned(plan: Plan, scene: Scene, another_day: bool = False) -> Planned:
     """The scene of a planned recording: the fitted cameras and bodies under other conditions.
 
-    Marks that would leave the image, or come behind the camera, have weight zero.
+    Marks that would leave the image or the field of the lens, or come too near, have weight zero.
 
     Args:
         plan: what is changed.
@@ -248,8 +248,9 @@ def planned(plan: Plan, scene: Scene, another_day: bool = False) -> Planned:
         changed = _on_another_day(changed)
     changed = changed.with_effects(scene.fitted_effects(), scene.room)
     tables = zip(changed.tables, predict_pixels(changed.state, changed.network), strict=True)
+    nearest = _nearest(scene)
     weights = [
-        _seen(changed, rows, np.asarray(pixels)[: len(rows)], _nearest(scene)).astype(float)
+        _seen(changed, rows, np.asarray(pixels)[: len(rows)], nearest).astype(float)
         for rows, pixels in tables
     ]
     return Planned(changed, tuple(weights))
