@@ -431,7 +431,7 @@ def test_marks_behind_the_camera_have_no_weight(frontal):
 
 
 def test_a_tilted_plate_does_not_reach_through_the_camera(frontal):
-    """Its middle is at an eighth of the distance: all of it is nearer than 0.45 of what was seen."""
+    """Its middle is at an eighth of the distance: all of it is nearer than a plan may bring it."""
     inside, weight = seen_by(
         frontal, lambda poses, middles, eye, up: poses + [0, 1.2, 0, 0, 0, 0.25 - DISTANCE]
     )
