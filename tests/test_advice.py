@@ -16,6 +16,7 @@ from jaxvm.discover.advice import (
     _information,
     _without_priors,
     advise,
+    under_its_name,
 )
 from jaxvm.discover.courses import Course
 from jaxvm.discover.groups import Group
@@ -25,6 +26,7 @@ from jaxvm.discover.rivals import Rival
 from jaxvm.discover.select import DECIDED
 from jaxvm.geometry.targets import grid_points
 from jaxvm.network.scene import Scene, build
+from jaxvm.physics.catalogue import CATALOGUE
 from jaxvm.physics.catalogue.entry import each
 from jaxvm.physics.effects import Scope, Term
 from jaxvm.recording import (
@@ -169,6 +171,58 @@ def test_the_predicted_gap_is_the_difference_of_refits(stereo, driver, amplitude
     # What the present recording alone brings is less.
     alone = adjust(stereo.with_effects((wrong.effect((0.0,)),), ROOM), check=False)
     assert 2.0 * alone.cost < 0.9 * gap
+
+
+def test_a_rival_may_have_all_terms_of_its_name(stereo):
+    """A bracket that grows in z, as far as one recording tells, may have grown in x and y."""
+    bracket = next(entry for entry in CATALOGUE if entry.id == "bracket-growth")
+
+    def shift(*ports: str, named: bool = False) -> Hypothesis:
+        group = Group(tuple(map(Term, ports)), "camera")
+        return replace(SHIFT, group=group, entries=(bracket,) if named else ())
+
+    ports = tuple(f"mount.shift_{axis}" for axis in "xyz")
+    further = shift("mount.shift_z", named=True).remainder()
+    assert further is not None
+    assert [term.port for term in further.group.terms] == ["mount.shift_x", "mount.shift_y"]
+    assert shift(*ports, named=True).remainder() is None
+    assert shift("mount.shift_z").remainder() is None
+
+    finding = replace(FOCAL, group=Group((Term("sensor.focal"), Term("sensor.cx")), "camera"))
+    scene = stereo.with_effects((finding.effect((AMPLITUDE, 0.5)),), (8, 4))
+
+    def behind(hypothesis: Hypothesis) -> float:
+        """By how much it is, where the finding is right."""
+        (batch,) = _batches(scene, 0, as_rivals(hypothesis), ())
+        (effects,) = batch.rivals.values()
+        left = batch._without(_information(batch.scene, ones(scene)), [0], effects)
+        return float(np.array([AMPLITUDE, 0.5]) @ left @ np.array([AMPLITUDE, 0.5]))
+
+    full = behind(shift(*ports))
+    assert behind(shift("mount.shift_z", named=True)) == pytest.approx(full, rel=1e-6)
+    assert behind(shift("mount.shift_z")) > 2.0 * full > 1.0
+    # So may the finding where the rival is right.
+    own = under_its_name(shift("mount.shift_z", named=True), (SHIFT,))
+    assert own == [further, SHIFT]
+
+
+def test_a_rival_may_have_constants_of_its_own(stereo):
+    """The same effect with another time constant is told from it by no recording."""
+
+    def lag(seconds: float) -> Hypothesis:
+        return replace(FOCAL, course=Course("body_degC", "lag", (seconds,), 20.0))
+
+    tau = float(np.median(np.diff(np.asarray(stereo.network.channels.epoch_time))))
+    late = stereo.with_effects((lag(tau).effect((20.0 * AMPLITUDE,)),), ROOM)
+    (held,) = _batches(late, 0, as_rivals(lag(1.3 * tau)), ())
+
+    def behind(batch) -> float:
+        """By how much it is, where the finding is right."""
+        left = batch._without(_information(batch.scene, ones(late)), [0], batch.rivals[0])
+        return float((20.0 * AMPLITUDE) ** 2 * left[0, 0])
+
+    assert behind(held) > 1e3
+    assert behind(held.awake(ones(late))) < 0.01 * behind(held)
 
 
 def test_a_larger_effect_and_less_noise_decide_more(stereo):

@@ -8,9 +8,10 @@ amplitudes of the finding (columns C), B the other unknowns and R the columns of
 
 is the expected gap in chi-square between the finding and the rival (MATHEMATICS 1.8). Where the
 rival is right, with the amplitudes that stand for the finding in the first recording, it is that
-of the rival to the finding; the smaller of the two counts. Either may follow any of its drivers,
-and nobody knows whether what goes with time begins anew or has gone on for a day: what parts the
-two only because of that is no promise.
+of the rival to the finding; the smaller of the two counts. Either may have all terms that its name
+has (a mount that turned about one axis may turn about three), constants of its own, and any of its
+drivers, and nobody knows whether what goes with time begins anew or has gone on for a day: what
+parts the two only because of that is no promise.
 
 What the first recording has shown is known. A further one that adds d to the gap makes of the log
 odds l (on the scale of chi-square) a normal variable of variance 4 d and of mean l + d where the
@@ -47,6 +48,10 @@ _SURE = 0.99
 """Chance from which on plans are as good as each other, and the cheaper one comes first."""
 
 
+_TRACE = 1e-5
+"""Share of the finding that its rivals stand for in the scene in which plans are weighed."""
+
+
 @dataclass(frozen=True)
 class Advice:
     """What one plan would bring for one finding.
@@ -56,12 +61,14 @@ class Advice:
         rivals: what the finding may be mistaken for.
         gaps: expected gap in chi-square to each rival, of both recordings together.
         chances: that finding and rival come apart at 20:1, whichever of the two is right.
+        among: probability that the finding or one of its rivals is right.
     """
 
     plan: Plan
     rivals: tuple[Hypothesis, ...]
     gaps: tuple[float, ...]
     chances: tuple[float, ...]
+    among: float = 1.0
 
     @property
     def odds(self) -> float:
@@ -69,13 +76,21 @@ class Advice:
         return float(np.exp(min(0.5 * min(self.gaps), 60.0)))
 
     @property
-    def chance(self) -> float:
-        """Of the rival that is hardest to tell apart."""
+    def parts(self) -> float:
+        """Chance that the rival that is hardest to tell apart comes apart, if one of them is right.
+
+        A plan that parts two wrong names leaves nothing that is right.
+        """
         return min(self.chances)
 
     @property
+    def chance(self) -> float:
+        """Chance that what is right comes apart from all others."""
+        return self.among * self.parts
+
+    @property
     def decides(self) -> bool:
-        """Whether all rivals are likely to be told apart at 20:1."""
+        """Whether that is likely."""
         return self.chance >= PROMISED
 
 
@@ -88,6 +103,7 @@ def advise(
     plans: tuple[Plan, ...] = PLANS,
     log_odds: Sequence[float] | None = None,
     others: Sequence[Hypothesis] = (),
+    among: float = 1.0,
 ) -> list[Advice]:
     """Plans by what they bring for telling a finding from its rivals, best first.
 
@@ -104,9 +120,10 @@ def advise(
         plans: further recordings to weigh.
         log_odds: twice the natural log of the odds for the finding against each rival, as they
             stand; even without.
-        others: the finding's own physics after other drivers.
+        others: the finding's own physics in other terms or after other drivers (`under_its_name`).
+        among: probability that the finding or one of the rivals is right.
     """
-    batches = _batches(scene, place, rivals, others)
+    batches = [batch.awake(weights) for batch in _batches(scene, place, rivals, others)]
     kept = [number for batch in batches for number in batch.rivals]
     if not kept:
         return []
@@ -139,20 +156,28 @@ def advise(
         gain = np.maximum(expected - before, 0.0)
         chances = _chances(even, gain, decisive_gap(drop))
         own = tuple(rivals[k].hypothesis for k in kept)
-        advices.append(Advice(plan, own, tuple(expected.tolist()), tuple(chances.tolist())))
-        if sum(advice.chance >= _SURE for advice in advices) == _ENOUGH:
+        advices.append(Advice(plan, own, tuple(expected.tolist()), tuple(chances.tolist()), among))
+        if sum(advice.parts >= _SURE for advice in advices) == _ENOUGH:
             break
-    return sorted(advices, key=lambda advice: -min(advice.chance, _SURE))
+    return sorted(advices, key=lambda advice: -min(advice.parts, _SURE))
+
+
+def under_its_name(hypothesis: Hypothesis, others: Iterable[Hypothesis]) -> list[Hypothesis]:
+    """What may be found under the same name once more is recorded: further terms, other drivers."""
+    each = (hypothesis, *others)
+    remainders = [further for own in each if (further := own.remainder())]
+    return [*remainders[:1], *others, *remainders[1:]]
 
 
 @dataclass(frozen=True)
 class _Batch:
-    """The scene of a finding, with some rivals after its effects, at amplitude zero.
+    """The scene of a finding, with some rivals after its effects.
 
     Attributes:
-        scene: with all of them.
+        scene: with all of them, at amplitude zero until it is `awake`.
         place: number of the finding among the effects.
-        others: numbers of the effects that are its own physics after other drivers.
+        others: numbers of the effects that are its own physics in other terms or after other
+            drivers.
         rivals: numbers of the effects of each rival, the leading one first, by the rival's number.
     """
 
@@ -170,15 +195,30 @@ class _Batch:
         amplitudes = self._amplitudes()
         return _square(amplitudes, self._without(information, [self.place], []))
 
+    def awake(self, weights: tuple[np.ndarray, ...]) -> "_Batch":
+        """The batch with a trace of everything in question in its scene.
+
+        The recordings may move the constants of a rival as well as its amplitudes, and at amplitude
+        zero nothing depends on them. A trace of what stands for the finding is enough: it moves no
+        mark, and how large the columns of an unknown are is nothing to what they explain.
+        """
+        information = _information(self.scene, weights)
+        effects = list(self.scene.fitted_effects())
+        for k in (*self.others, *chain(*self.rivals.values())):
+            trace = _TRACE * self._mimic(information, k)
+            effects[k] = effects[k].with_values(trace, effects[k].constants)
+        return replace(self, scene=self.scene.with_effects(tuple(effects), self.scene.room))
+
     def mimics(self, information: np.ndarray) -> list[np.ndarray]:
         """Amplitudes of the rivals that stand for the finding."""
-        found = []
-        for leading, *_ in self.rivals.values():
-            both = self._without(information, [self.place, leading], [])
-            n = len(self._columns([self.place]))
-            known = np.linalg.pinv(both[n:, n:], rcond=1e-10, hermitian=True)
-            found.append(known @ both[n:, :n] @ self._amplitudes())
-        return found
+        return [self._mimic(information, leading) for leading, *_ in self.rivals.values()]
+
+    def _mimic(self, information: np.ndarray, other: int) -> np.ndarray:
+        """Amplitudes of an effect that stand for the finding."""
+        both = self._without(information, [self.place, other], [])
+        n = len(self._columns([self.place]))
+        known = np.linalg.pinv(both[n:, n:], rcond=1e-10, hermitian=True)
+        return known @ both[n:, :n] @ self._amplitudes()
 
     def gaps(self, information: np.ndarray, mimics: list[np.ndarray]) -> np.ndarray:
         """The smaller of the gaps where the finding is right and where the rival is, of each."""
@@ -249,7 +289,7 @@ def _batches(
     groups: list[dict[int, list[Hypothesis]]] = []
     for number, rival in known.items():
         group = [rival.hypothesis]
-        for other in rival.others:
+        for other in under_its_name(rival.hypothesis, rival.others):
             group += [other] if has_room(*own, *group, other) else []
         if not groups or not has_room(*own, *chain(*groups[-1].values()), *group):
             groups.append({})

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from jaxvm.compiling import forget_compiled_if_many
-from jaxvm.discover.advice import advise
+from jaxvm.discover.advice import advise, under_its_name
 from jaxvm.discover.collocation import collocate
 from jaxvm.discover.constants import run_away
 from jaxvm.discover.diagnosis import Diagnosis, Finding, Quality
@@ -157,7 +157,8 @@ def _with_advice(final: Adjustment, finding: Finding, place: int, parts: Split) 
         log_odds=[
             2.0 * float(np.log(max(finding.weight, 1e-9) / rival.weight)) for rival in others
         ],
-        others=finding.others,
+        others=under_its_name(finding.hypothesis, finding.others),
+        among=min(finding.weight + sum(rival.weight for rival in finding.rivals), 1.0),
     )
     return replace(finding, advice=tuple(found))
 

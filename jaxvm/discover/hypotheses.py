@@ -5,7 +5,7 @@ products when they are scored.
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -152,6 +152,18 @@ class Hypothesis:
         alike = (self.course.driver == "constant") == (other.course.driver == "constant")
         unnamed = bool(self.entries) and not other.entries
         return unnamed and alike and self.scope == other.scope and self.group.mark is None
+
+    def remainder(self) -> "Hypothesis | None":
+        """What it lacks of its name: the further terms of the fullest group that contains its own.
+
+        A mount that turned about one axis, as far as one recording tells, may have turned about all
+        of them. None where there are no further ones, or more than `FREE`.
+        """
+        own = set(self.group.terms)
+        alike = [terms for e in self.entries[:1] for terms in e.groups if own < {*terms}]
+        fullest = max((terms for terms in alike if len(terms) <= FREE), key=len, default=())
+        further = tuple(term for term in fullest if term not in own)
+        return replace(self, group=replace(self.group, terms=further)) if further else None
 
     def effect(self, amplitudes) -> Effect:
         """The hypothesis as an effect with given amplitudes."""

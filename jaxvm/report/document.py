@@ -103,6 +103,7 @@ def _finding(finding: Finding) -> dict[str, Any]:
                 "rivals": [rival.effect(()).name for rival in advice.rivals],
                 "gaps": list(advice.gaps),
                 "chances": list(advice.chances),
+                "chance": advice.chance,
                 "odds": min(advice.odds, 1e12),
                 "decides": bool(advice.decides),
             }
