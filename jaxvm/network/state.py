@@ -4,6 +4,7 @@ Poses are 6-vectors (turn, shift): a rotation vector (rad) and a translation (m)
 frame of their name into the first. Static bodies have one row, moving ones a row for each epoch.
 """
 
+import math
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -61,7 +62,7 @@ class Layout:
         for other, shape in self.fields:
             if other == name:
                 return total
-            total += int(np.prod(shape))
+            total += math.prod(shape)
         raise KeyError(name)
 
     @property
@@ -72,7 +73,7 @@ class Layout:
     @property
     def size(self) -> int:
         """Length of the flat vector."""
-        return sum(int(np.prod(shape)) for _, shape in self.fields)
+        return sum(math.prod(shape) for _, shape in self.fields)
 
     def slots(self, name: str, rows: Int[np.ndarray, " n"], width: int | None = None) -> np.ndarray:
         """Positions [n, width] of the given rows of a table; `width` cuts the last columns off."""
@@ -83,7 +84,7 @@ class Layout:
     def all(self, name: str) -> np.ndarray:
         """Positions of a whole field."""
         start = self.offset(name)
-        return np.arange(start, start + int(np.prod(self.shapes[name])))
+        return np.arange(start, start + math.prod(self.shapes[name]))
 
     def restore(self, flat: Float[Array, " n"]) -> State:
         """State of a flat vector (also under jit)."""
@@ -100,5 +101,5 @@ def _restored(layout: Layout, flat) -> State:
     fields = {}
     for name, shape in layout.fields:
         start = layout.offset(name)
-        fields[name] = jnp.reshape(flat[start : start + int(np.prod(shape))], shape)
+        fields[name] = jnp.reshape(flat[start : start + math.prod(shape)], shape)
     return State(**fields)

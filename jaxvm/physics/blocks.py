@@ -57,14 +57,16 @@ def by_blocks(
     leaves, structure = jax.tree.flatten(((table, *common), named))
     n_leaves = jax.tree.structure(table).num_leaves
     leaves, others = [np.asarray(leaf) for leaf in leaves[:n_leaves]], leaves[n_leaves:]
-    n = max(len(leaf) for leaf in leaves if leaf.ndim)
+    lengths = {len(leaf) for leaf in leaves if leaf.ndim}
+    n = max(lengths)
     size = size or (_SMALL if n <= _SMALL else BLOCK)
     only = None if only is None or len(only) == n else only
     wanted = n if only is None else len(only)
     found = []
     # Without any row the shape of the result is that of a block.
     for start in range(0, max(wanted, 1), size):
-        block = [_cut(leaf, start, size, only) if leaf.ndim else leaf for leaf in leaves]
+        rows = {length: _rows(start, size, length, only) for length in lengths}
+        block = [_cut(leaf, rows[len(leaf)]) if leaf.ndim else leaf for leaf in leaves]
         if isinstance(function, program):
             found.append(function.of_leaves([*block, *others], structure))
         else:
@@ -82,12 +84,16 @@ def by_blocks(
     return jax.tree.map(joined, *found)
 
 
-def _cut(leaf: np.ndarray, start: int, size: int, only: np.ndarray | None) -> np.ndarray:
+def _rows(start: int, size: int, n: int, only: np.ndarray | None) -> slice | np.ndarray:
     """Rows of a block; the last row again where the table ends."""
-    if only is None and start + size <= len(leaf):
-        return leaf[start : start + size]
-    rows = np.arange(len(leaf)) if only is None or not len(only) else only
-    return leaf[rows[np.minimum(np.arange(start, start + size), len(rows) - 1)]]
+    if only is None and start + size <= n:
+        return slice(start, start + size)
+    rows = np.arange(n) if only is None or not len(only) else only
+    return rows[np.minimum(np.arange(start, start + size), len(rows) - 1)]
+
+
+def _cut(leaf: np.ndarray, rows: slice | np.ndarray) -> np.ndarray:
+    return leaf[rows] if isinstance(rows, slice) else leaf.take(rows, axis=0)
 
 
 def rounded(n: int) -> int:
@@ -101,7 +107,12 @@ def rounded(n: int) -> int:
 
 def roomy(values, axis: int = 0, least: int = 64) -> Any:
     """An array filled up with its last value along an axis, to a power of two, `least` or more."""
-    return _grown(values, axis, least, mode="edge")
+    spare = _spare(values, axis, least)
+    if not spare:
+        return values
+    values = np.asarray(values)
+    last = values.take([-1], axis=axis)
+    return np.concatenate([values, np.repeat(last, spare, axis=axis)], axis=axis)
 
 
 def continued(series):
@@ -109,16 +120,21 @@ def continued(series):
 
     Where a series ends, neither its values nor its central differences change.
     """
-    if series.shape[-1] < 2:
+    n = series.shape[-1]
+    spare = _spare(series, -1, 64) if n > 1 else 0
+    if not spare:
         return series
-    return _grown(series, -1, 64, mode="reflect", reflect_type="odd")
+    series = np.asarray(series)
+    if spare >= n:
+        widths = [(0, 0)] * (series.ndim - 1) + [(0, spare)]
+        return np.pad(series, widths, mode="reflect", reflect_type="odd")
+    mirrored = series[..., n - 1 - spare : n - 1][..., ::-1]
+    return np.concatenate([series, 2.0 * series[..., -1:] - mirrored], axis=-1)
 
 
-def _grown(values, axis: int, least: int, **how):
+def _spare(values, axis: int, least: int) -> int:
+    """How many are missing along an axis to a power of two, `least` or more; none on the device."""
     n = values.shape[axis]
-    size = max(least, 1 << max(n - 1, 0).bit_length())
-    if whole(values) or n in (0, size):
-        return values
-    widths = [(0, 0)] * np.ndim(values)
-    widths[axis] = (0, size - n)
-    return np.pad(np.asarray(values), widths, **how)
+    if whole(values) or n == 0:
+        return 0
+    return max(least, 1 << (n - 1).bit_length()) - n
