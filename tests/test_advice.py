@@ -243,6 +243,15 @@ def test_after_three_sure_plans_no_costlier_one_is_weighed(stereo):
     assert len(advise(stereo, ones(stereo), 0, as_rivals(SHIFT), 1e9, 4 * plans)) == 8
 
 
+def test_a_plan_that_parts_wrong_names_alone_is_no_promise(stereo):
+    plans = (PLAN["nearer"],)
+    (sure,) = advise(stereo, ones(stereo), 0, as_rivals(SHIFT), 1e-9, plans)
+    (less,) = advise(stereo, ones(stereo), 0, as_rivals(SHIFT), 1e-9, plans, among=0.9)
+    assert less.parts == sure.parts == sure.chance > 0.99
+    assert less.chance == pytest.approx(0.9 * sure.chance)
+    assert sure.decides and not less.decides
+
+
 def test_rivals_beside_each_other_are_weighed_alone(stereo):
     """More at once than the room holds, in any order: each has the gap that it has by itself."""
     turn = rival("mount.turn_x", "body_degC", "linear", 20.0)
