@@ -16,6 +16,7 @@ from jaxvm.discover.select import best_named, evidence, identity, log_prior, ref
 from jaxvm.physics.catalogue import entries_for
 from jaxvm.physics.catalogue.entry import each
 from jaxvm.physics.effects import Effect, Scope, Term
+from jaxvm.physics.forms import FORMS
 from jaxvm.solve.adjust import adjust
 
 FOCAL = (Term("sensor.focal"),)
@@ -52,6 +53,37 @@ def test_shifts_in_pixels_are_no_part_of_the_size_of_a_lens():
     plausible = [log_prior(heats, np.array([2e-4, *px])) for px in ((0.0, 0.0), (0.04, 0.1))]
     assert plausible[0] == plausible[1]
     assert log_prior(heats, np.array([5e-3, 0.0, 0.0])) < plausible[0] - 2.0
+
+
+@pytest.mark.parametrize("form", ["affine", "affine lag", "lag with state", "hysteresis"])
+def test_what_a_course_is_at_zero_is_no_part_of_its_size(form):
+    """A plate of steel that counts from 20 degrees is a plate of steel."""
+    terms = (Term("target.scale"),)
+    names = entries_for(terms, "target", ("quantity", "temperature"), "linear")
+    bases = FORMS[form].bases
+    amplitudes = np.where([basis in ("one", "first state") for basis in bases], -3e-3, 1.2e-5)
+
+    def prior(form: str, amplitudes) -> float:
+        constants = (100.0,) * len(FORMS[form].constants)
+        course = Course("ambient_degC", form, constants)
+        own = Hypothesis(Group(terms, "target"), course, Scope(target=("plate",)), names[:1])
+        return log_prior(own, np.array(amplitudes))
+
+    assert names[0].id == "target-expansion"
+    assert prior(form, amplitudes) == prior("linear", [1.2e-5]) == 0.0
+    assert prior(form, 100.0 * amplitudes) < -3.0
+
+
+def test_the_size_of_a_vibration_has_no_phase():
+    terms = (Term("mount.turn_x"),)
+    names = entries_for(terms, "camera", ("time",), "periodic")
+    course = Course("time", "periodic", (10.0,))
+    shakes = Hypothesis(Group(terms, "camera"), course, Scope(camera=("left",)), names)
+    tiny = names[0].plausible[0] / 100.0
+    phases = [tiny * np.array([np.cos(phase), np.sin(phase)]) for phase in (0.0, 1.0, np.pi / 2)]
+    priors = [log_prior(shakes, amplitudes) for amplitudes in phases]
+    assert priors[0] < -3.0
+    np.testing.assert_allclose(priors, priors[0])
 
 
 @pytest.mark.parametrize("late, name", [(1.3e-3, "trigger-late"), (0.4, "frame-slip")])

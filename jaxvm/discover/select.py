@@ -139,10 +139,12 @@ def _log_size(entry: Entry, hypothesis: Hypothesis, amplitudes: np.ndarray) -> f
     Of terms of several units those count that have the unit in which the size is given.
     """
     units = [PORTS[PORT_INDEX[term.port]].unit for term in hypothesis.group.terms]
-    first = amplitudes[:: len(FORMS[hypothesis.course.form].bases)]
+    form = FORMS[hypothesis.course.form]
+    counted = [basis in (form.sized_by or form.bases[:1]) for basis in form.bases]
     # Of a rival that was not fitted no amplitudes are known.
-    known = zip(first, units, strict=False)
-    size = float(np.linalg.norm([a for a, unit in known if unit == units[0]]))
+    each = np.reshape(amplitudes, (-1, len(form.bases)))[:, counted]
+    known = zip(each, units, strict=False)
+    size = float(np.linalg.norm([a for own, unit in known for a in own if unit == units[0]]))
     if size == 0.0:
         return 0.0
     low, high = entry.plausible

@@ -180,6 +180,9 @@ class Form:
     one_course: bool = False
     """Whether its bases make up one course (a lag and its first state), by which whatever moves
     does so along one line; a vibration goes round, and every jump has a way of its own."""
+    sized_by: tuple[str, ...] = ()
+    """Bases whose amplitudes together are the size of an effect, for a unit of its driver; by
+    default the first one. What it is at a driver of zero is no size."""
 
     def read_by(self, basis: int, constants: Sequence[T]) -> Sequence[T]:
         """Those constants of the form, one or two, that one of its bases reads."""
@@ -219,6 +222,7 @@ FORMS: dict[str, Form] = {
             (),
             "in proportion to {driver}, from a reference of its own",
             one_course=True,
+            sized_by=("linear",),
         ),
         Form(
             "affine lag",
@@ -227,6 +231,7 @@ FORMS: dict[str, Form] = {
             "following {driver} with a lag, from a reference of its own",
             centred=True,
             one_course=True,
+            sized_by=("lag",),
         ),
         Form(
             "parabola",
@@ -235,6 +240,7 @@ FORMS: dict[str, Form] = {
             "as a parabola of {driver}, from a reference of its own",
             centred=True,
             one_course=True,
+            sized_by=("linear",),
         ),
         Form(
             "quadratic",
@@ -307,6 +313,7 @@ FORMS: dict[str, Form] = {
             "with {driver} and with backlash",
             centred=True,
             one_course=True,
+            sized_by=("linear", "play"),
         ),
         Form(
             "hysteresis with state",
@@ -315,6 +322,7 @@ FORMS: dict[str, Form] = {
             "with {driver} and with backlash, from a contact of its own at first",
             centred=True,
             one_course=True,
+            sized_by=("linear", "play"),
         ),
         Form("onset", ("onset",), (_TAU,), "settling exponentially with {driver}"),
         Form("fading", ("decay",), (_TAU,), "fading exponentially with {driver}"),
@@ -339,6 +347,7 @@ FORMS: dict[str, Form] = {
             (Constant("period", "s"),),
             "with {driver}, from a direction that turns",
             centred=True,
+            sized_by=("turned", "turned aside"),
         ),
         Form(
             "staircase",
@@ -372,6 +381,7 @@ FORMS: dict[str, Form] = {
             ("sine", "cosine"),
             (Constant("period", "driver"),),
             "periodically in {driver}",
+            sized_by=("sine", "cosine"),
         ),
         *(
             Form(
