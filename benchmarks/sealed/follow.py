@@ -47,7 +47,7 @@ def asked(folder: Path, entries: list[dict]) -> list[dict]:
             ids = {c["physics"]: _name(c) for c in claims(finding)}
             rivals = {ids[name] for name in best["rivals"]} - {before[0]}
             if best["decides"] and rivals:
-                told = {"plan": best["plan"], "chance": best.get("chance", min(best["chances"]))}
+                told = {"plan": best["plan"], "chance": best["chance"]}
                 told |= {"before": before, "rivals": sorted(rivals), "claims": claims(finding)}
                 cases.append({"entry": entry} | told)
                 break

@@ -110,7 +110,7 @@ def observation_driver_table(scene: Scene, factor: PixelFactor, rows: np.ndarray
     padded = np.append(rows, np.full(factor.slots.shape[0] - len(rows), rows[-1]))
     size = sizes[scene.recording.observations.camera[padded]]
     up = jnp.asarray(scene.model.up, float)
-    return by_blocks(_driver_table, (factor, size), roomy(scene.state.flatten()), up)
+    return by_blocks(_driver_table, (factor.untiled(), size), roomy(scene.state.flatten()), up)
 
 
 @program

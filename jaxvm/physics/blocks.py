@@ -57,16 +57,15 @@ def by_blocks(
     leaves, structure = jax.tree.flatten(((table, *common), named))
     n_leaves = jax.tree.structure(table).num_leaves
     leaves, others = [np.asarray(leaf) for leaf in leaves[:n_leaves]], leaves[n_leaves:]
-    lengths = {len(leaf) for leaf in leaves if leaf.ndim}
-    n = max(lengths)
+    (n,) = {len(leaf) for leaf in leaves if leaf.ndim}
     size = size or (_SMALL if n <= _SMALL else BLOCK)
     only = None if only is None or len(only) == n else only
     wanted = n if only is None else len(only)
     found = []
     # Without any row the shape of the result is that of a block.
     for start in range(0, max(wanted, 1), size):
-        rows = {length: _rows(start, size, length, only) for length in lengths}
-        block = [_cut(leaf, rows[len(leaf)]) if leaf.ndim else leaf for leaf in leaves]
+        rows = _rows(start, size, n, only)
+        block = [_cut(leaf, rows) if leaf.ndim else leaf for leaf in leaves]
         if isinstance(function, program):
             found.append(function.of_leaves([*block, *others], structure))
         else:

@@ -182,7 +182,7 @@ class Form:
     does so along one line; a vibration goes round, and every jump has a way of its own."""
     sized_by: tuple[str, ...] = ()
     """Bases whose amplitudes together are the size of an effect, for a unit of its driver; by
-    default the first one. What it is at a driver of zero is no size."""
+    default those of the first one's name. What it is at a driver of zero is no size."""
 
     def read_by(self, basis: int, constants: Sequence[T]) -> Sequence[T]:
         """Those constants of the form, one or two, that one of its bases reads."""
