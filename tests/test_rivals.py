@@ -126,6 +126,34 @@ def test_a_rival_pays_no_more_for_its_instant_than_the_finding(warmed):
     assert turn.weight > 0.3 * chief.weight * np.exp(-0.5 * turn.gap)
 
 
+def test_the_forms_of_a_name_share_its_prior_and_add_up(warmed, monkeypatch):
+    """A name that was asked along in two forms is as heavy by both as another by its only one."""
+    bend = 2.0 * effect_deviations(fitted(warmed, 0.0)[-1].adjustment)[-1][1]
+    parts, plain, tests, found = fitted(warmed, bend)
+    own = found.hypothesis
+    key = own.entries[0].id
+
+    def at(camera: str, form: str, asked: int) -> Hypothesis:
+        course = Course("ambient_degC", form)
+        shared = {"course": course, "scope": Scope(camera=(camera,))}
+        return replace(own, entries=own.entries[:1], alternatives={key: asked}, **shared)
+
+    alike = [at("once", "linear", 1), at("twice", "linear", 2), at("twice", "quadratic", 2)]
+
+    def resembling(ranking, scene, own, full, variance, limit):
+        for hypothesis in alike:
+            yield hypothesis, 0.0, 0.0, found.amplitudes[: hypothesis.n_columns]
+
+    monkeypatch.setattr("jaxvm.discover.rivals._resembling", resembling)
+    # What a parabola's column costs is no matter here.
+    monkeypatch.setattr("jaxvm.discover.rivals.price_of_columns", lambda *_: 0.0)
+    _, others = rivals(plain, found.adjustment, own, found.effect, tests, parts.n)
+    weights = {r.hypothesis.scope.camera: r.weight for r in others}
+    assert weights[("twice",)] == pytest.approx(weights[("once",)], rel=0.02)
+    # Both forms follow the one driver, so that there is no other that it may follow.
+    assert all(not r.others for r in others)
+
+
 def _raised(instants, drops) -> np.ndarray:
     """Drops of ramps from some instants on, with the best one raised to the peak."""
     group = Group((Term("sensor.focal"),), "camera")

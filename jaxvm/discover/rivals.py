@@ -53,17 +53,29 @@ class Rival:
 
 @dataclass
 class _Claim:
-    """One name at one place, with all drivers that do."""
+    """One name at one place, with all drivers and forms that do.
+
+    A name shares its prior among them (`log_prior`), so that its weight is the sum over them: one
+    with many forms would be too light by its best alone.
+    """
 
     hypothesis: Hypothesis
     names: tuple[str, ...]
     gap: float
     log_odds: float
-    of_driver: dict[str, tuple[float, Hypothesis]] = field(default_factory=dict)
+    of_kind: dict[tuple[str, str], tuple[float, Hypothesis]] = field(default_factory=dict)
 
     @property
     def weight(self) -> float:
-        return float(np.logaddexp.reduce([odds for odds, _ in self.of_driver.values()]))
+        return float(np.logaddexp.reduce([odds for odds, _ in self.of_kind.values()]))
+
+    def of_driver(self) -> list[tuple[float, Hypothesis]]:
+        """The best form of each driver, best first."""
+        ordered = sorted(self.of_kind.values(), key=lambda known: -known[0])
+        best: dict[str, tuple[float, Hypothesis]] = {}
+        for odds, hypothesis in ordered:
+            best.setdefault(hypothesis.course.driver, (odds, hypothesis))
+        return list(best.values())
 
 
 def rivals(
@@ -111,9 +123,9 @@ def rivals(
             if odds > claim.log_odds:
                 claim.hypothesis, claim.names = named, names
                 claim.gap, claim.log_odds = gap, odds
-            driver = named.course.driver
-            if driver not in claim.of_driver or odds > claim.of_driver[driver][0]:
-                claim.of_driver[driver] = odds, named
+            kind = named.course.driver, named.course.form
+            if kind not in claim.of_kind or odds > claim.of_kind[kind][0]:
+                claim.of_kind[kind] = odds, named
 
     scene, found = before.scene, []
     # Neither is among the hypotheses that are scored together: what every image has for itself, and
@@ -167,7 +179,7 @@ def _foremost(ordered: list[Rival]) -> list[Rival]:
 
 def _rival(claim: _Claim, weight: float, driver: str = "") -> Rival:
     first = driver or claim.hypothesis.course.driver
-    ordered = sorted(claim.of_driver.values(), key=lambda known: -known[0])
+    ordered = claim.of_driver()
     least = ordered[0][0] - np.log(_ODDS)
     near = [h for odds, h in ordered if h.course.driver != first and odds > least]
     return Rival(claim.hypothesis, claim.gap, weight, tuple(near), claim.names)
