@@ -1,14 +1,17 @@
 """Monte Carlo: statistics against NumPy, any batch and device, stopped and killed and resumed."""
 
 import importlib
+import json
 import signal
 import time
+import tomllib
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -41,6 +44,7 @@ from jaxvm.network.scene import build
 from jaxvm.physics.effects import Effect, Term
 from jaxvm.pose.precision import Setup
 from jaxvm.recording.model import Prior
+from jaxvm.recording.parse import parse_model
 from jaxvm.scenes import parse_description, simulate_network
 from jaxvm.solve.adjust import adjust
 
@@ -421,11 +425,15 @@ def test_trials_go_to_one_file(tmp_path, scene):
     found = montecarlo(scene, last, 4, 6).results
     frame = pd.read_parquet(found.save(tmp_path / "all.parquet"))
     assert frame["error.error[5]"].to_numpy() == pytest.approx(found.errors[:, 5])
+    told = json.loads(pq.read_schema(tmp_path / "all.parquet").metadata[b"study"])
+    model = parse_model(tomllib.loads(told["study"]["model"]))
+    assert [c.name for c in model.cameras] == [c.name for c in scene.model.cameras]
+    assert {"jaxvm", "jax", "jaxlib", "equinox"} <= told["versions"].keys()
     xarray = pytest.importorskip("xarray")
     pytest.importorskip("h5netcdf")
     with xarray.open_dataset(found.save(tmp_path / "all.nc"), engine="h5netcdf") as data:
         assert np.allclose(data["error_error"], found.errors)
-        assert "jaxvm" in data.attrs["study"]
+        assert json.loads(data.attrs["study"]) == told
     with pytest.raises(ValueError, match="parquet or .nc"):
         found.save(tmp_path / "all.csv")
     assert "6 of 6, of which failed 0" in found.summary()

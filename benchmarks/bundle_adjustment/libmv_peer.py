@@ -2,15 +2,19 @@
 
     python libmv_peer.py FILE --solver DENSE_SCHUR|SPARSE_SCHUR [--repeats N]
 
-As `ceres_peer.py`, and with the same JSON, but for libmv's binary files: one camera (focal length,
-k1, k2) that all images share, principal point held. It reads what it needs of the format by itself:
-numbers with the least significant byte first, markers in pixels, k3, p1 and p2 zero.
+To be run by a Python that has pycolmap (which brings Ceres); it imports nothing of the project.
+One camera (focal length, k1, k2) that all images share, principal point held, no loss, 2 threads.
+It reads what it needs of the format by itself: numbers with the least significant byte first,
+markers in pixels, k3, p1 and p2 zero. It prints JSON: for each repetition the cost (half the sum of
+squares) and the seconds after every iteration, as Ceres itself reports them.
 """
 
 import argparse
 import json
+import os
+import re
+import tempfile
 
-import ceres_peer
 import numpy as np
 import pycolmap
 
@@ -66,6 +70,57 @@ def reconstruction(intrinsics, cameras, points, markers):
     return scene
 
 
+def captured(function):
+    """What a call prints to the file descriptor of standard output."""
+    with tempfile.TemporaryFile() as file:
+        kept = os.dup(1)
+        os.dup2(file.fileno(), 1)
+        try:
+            function()
+        finally:
+            os.dup2(kept, 1)
+            os.close(kept)
+        file.seek(0)
+        return file.read().decode()
+
+
+def solve(scene, solver, iterations):
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_principal_point = False
+    own = options.ceres
+    own.auto_select_solver_type = False
+    own.min_num_residuals_for_cpu_multi_threading = 0
+    inner = own.solver_options
+    inner.linear_solver_type = solver
+    inner.num_threads = 2
+    inner.max_num_iterations = iterations
+    inner.function_tolerance = 1e-7
+    inner.gradient_tolerance = 0.0
+    inner.parameter_tolerance = 0.0
+    inner.minimizer_progress_to_stdout = True
+    inner.logging_type = "PER_MINIMIZER_ITERATION"
+    config = pycolmap.BundleAdjustmentConfig()
+    for image in scene.images:
+        config.add_image(image)
+    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, scene)
+    found = {}
+
+    def run():
+        found["summary"] = adjuster.solve()
+
+    text = captured(run)
+    rows = []
+    for line in text.splitlines():
+        words = line.split()
+        # iter cost cost_change |gradient| |step| tr_ratio tr_radius ls_iter iter_time total_time
+        if re.fullmatch(r"\d+", words[0] if words else "") and len(words) == 10:
+            # A step that is refused is listed with the cost it would have had.
+            cost = float(words[1])
+            rows.append([min(cost, rows[-1][0]) if rows else cost, float(words[9])])
+    return rows
+
+
 def main():
     asked = argparse.ArgumentParser()
     asked.add_argument("file")
@@ -75,7 +130,7 @@ def main():
     options = asked.parse_args()
     problem = read(options.file)
     runs = [
-        ceres_peer.solve(reconstruction(*problem), options.solver, options.iterations)
+        solve(reconstruction(*problem), options.solver, options.iterations)
         for _ in range(options.repeats)
     ]
     print(json.dumps({"ceres": pycolmap.__ceres_version__, "runs": runs}))

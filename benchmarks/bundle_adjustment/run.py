@@ -1,20 +1,25 @@
 """Bundle adjustment of published and of simulated blocks of images against Ceres.
 
-    python benchmarks/bundle_adjustment/run.py --peer PYTHON [--rounds 5]
+    python benchmarks/bundle_adjustment/run.py --ceres PROGRAM [--rounds 5]
 
-PYTHON is one that has pycolmap, which brings Ceres with compiled cost functions (`ceres_peer.py`).
-Both take the same file, the same start, two threads, no loss, nothing held, and stop where the cost
-changes by less than 1e-7 of itself. Rounds are interleaved; medians count. Times are warm, from the
-problem in memory (for us with all index tables, for Ceres with its preprocessing) to within 0.1 %
-and 0.01 % of the best cost that either reaches, and to the end; compiling stands apart. Simulated
-blocks (`simulated.py`) are as large as published ones of Dubrovnik, Trafalgar and Venice; of the
-largest one three rounds are run, by the sparse solver. results.json, results.md and results.png are
-written here.
+PROGRAM is built from `peer/` (C++, Ceres' own automatic derivatives; `cmake -S
+benchmarks/bundle_adjustment/peer -B build && cmake --build build`, with the distribution's
+libceres-dev). Both take the same file, the same cost, the same start, two threads, no loss, nothing
+held, and stop where the cost changes by less than 1e-7 of itself. Rounds are interleaved; medians
+count. Times are warm, from the problem in memory (for us with all index tables, for Ceres with its
+preprocessing) to within 0.1 % and 0.01 % of the best cost that any reaches, and to the end;
+compiling stands apart. Peak memory is that of a whole process for one block, reading it included.
+Simulated blocks (`simulated.py`) are as large as published ones of Dubrovnik, Trafalgar and Venice;
+of the largest one three rounds are run, by the sparse solver. results.json, results.md and
+results.png are written here.
 """
 
 import argparse
+import gzip
 import json
 import os
+import resource
+import shutil
 import statistics
 import subprocess
 import sys
@@ -60,12 +65,28 @@ def ours(scene) -> tuple[list[list[float]], float]:
     ], before
 
 
-def theirs(python: Path, file: Path, solver: str) -> tuple[list[list[float]], str]:
+def theirs(program: Path, file: Path, solver: str) -> tuple[list[list[float]], str]:
     """The same of Ceres."""
-    command = [str(python), "-B", str(HERE / "ceres_peer.py"), str(file), "--solver", solver]
-    text = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-    found = json.loads(text)
-    return found["runs"][0], found["ceres"]
+    found, _ = said([str(program), str(file), solver])
+    return found["run"], found["ceres"]
+
+
+def said(command: list[str]) -> tuple[dict, float]:
+    """What a program prints, and its peak memory (MB)."""
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        text = process.stdout.read()
+        _, status, used = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise SystemExit(f"{command} ended with status {process.returncode}")
+    return json.loads(text), used.ru_maxrss / 1e3
+
+
+def peaks(file: Path, program: Path, solver: str) -> dict[str, float]:
+    """Peak memory (MB) of one process of each that solves a block."""
+    _, mine = said([sys.executable, __file__, "--peak", str(file)])
+    return {"jaxvm": mine, solver: said([str(program), str(file), solver])[1]}
 
 
 def seconds_to(rows: list[list[float]], cost: float) -> float:
@@ -73,7 +94,7 @@ def seconds_to(rows: list[list[float]], cost: float) -> float:
     return next((t for c, t in rows if c <= cost), float("inf"))
 
 
-def case(name: str, file: Path, python: Path, rounds: int) -> dict:
+def case(name: str, file: Path, program: Path, rounds: int) -> dict:
     """One block."""
     scene = build(import_bal(file))
     solvers = SOLVERS
@@ -89,7 +110,7 @@ def case(name: str, file: Path, python: Path, rounds: int) -> dict:
         runs["jaxvm"].append(rows)
         prepare.append(before)
         for solver in solvers:
-            rows, version = theirs(python, file, solver)
+            rows, version = theirs(program, file, solver)
             runs[solver].append(rows)
     result = {
         "block": name,
@@ -97,13 +118,13 @@ def case(name: str, file: Path, python: Path, rounds: int) -> dict:
         "ceres": version,
         "first_s": first,
         "preparing_s": statistics.median(prepare),
+        "peak_mb": peaks(file, program, solvers[-1]),
     }
+    best = min(rows[-1][0] for found in runs.values() for rows in found)
     for method, found in runs.items():
-        # COLMAP counts points behind a camera as fitted: each program has a best cost of its own.
-        best = min(found[0][-1][0], *(r[-1][0] for r in found))
         result[method] = {
             "start": found[0][0][0],
-            "cost": best,
+            "cost": found[0][-1][0],
             "evaluations": len(found[0]) - 1,
             "end_s": statistics.median(rows[-1][1] for rows in found),
             "run": found[0],
@@ -145,7 +166,9 @@ def table(rows: list[dict]) -> str:
     lines.append("")
     lines += [
         f"{row['block']}: {row['observations']:,} observations; {row['preparing_s']:.3f} s of ours "
-        f"are index tables; the first run took {row['first_s']:.1f} s with compiling."
+        f"are index tables; the first run took {row['first_s']:.1f} s with compiling; peak memory "
+        + ", ".join(f"{mb:,.0f} MB ({name})" for name, mb in row["peak_mb"].items())
+        + "."
         for row in rows
     ]
     made = [row for row in rows if row["block"].startswith("simulated")]
@@ -176,21 +199,32 @@ def figure(rows: list[dict]) -> Figure:
 def main() -> None:
     """Run all blocks and write the results."""
     asked = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    asked.add_argument("--peer", type=Path, required=True, help="python with pycolmap")
+    asked.add_argument("--ceres", type=Path, help="the program built from peer/")
+    asked.add_argument("--peak", type=Path, help="adjust this block alone, for its memory")
     asked.add_argument("--rounds", type=int, default=5)
     options = asked.parse_args()
+    if options.peak:
+        rows, _ = ours(build(import_bal(options.peak)))
+        used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        print(json.dumps({"cost": rows[-1][0], "peak_kb": used}))
+        return
+    if not options.ceres:
+        asked.error("--ceres is missing")
     load = os.getloadavg()[0]
     rows = []
-    for name in BLOCKS:
-        file = find_data(f"bal/{name}-pre.txt.gz")
-        if file is None:
-            raise SystemExit(f"bal/{name}-pre.txt.gz is not there: set JAXVM_DATA")
-        rows.append(case(name, file, options.peer, options.rounds))
     with tempfile.TemporaryDirectory() as folder:
+        for name in BLOCKS:
+            packed = find_data(f"bal/{name}-pre.txt.gz")
+            if packed is None:
+                raise SystemExit(f"bal/{name}-pre.txt.gz is not there: set JAXVM_DATA")
+            file = Path(folder) / f"{name}.txt"
+            with gzip.open(packed) as source, file.open("wb") as plain:
+                shutil.copyfileobj(source, plain)
+            rows.append(case(name, file, options.ceres, options.rounds))
         for cameras, (points, views) in SIMULATED.items():
             file = Path(folder) / f"simulated-{cameras}-{points}.txt"
             simulated.write(file, cameras, points, views)
-            rows.append(case(file.stem, file, options.peer, options.rounds))
+            rows.append(case(file.stem, file, options.ceres, options.rounds))
             print(json.dumps({k: v for k, v in rows[-1].items() if k != "run"})[:200], flush=True)
     found = {"cores": os.cpu_count(), "load_before": load, "rows": rows}
     write(HERE, json.loads(json.dumps(found, default=float)), table(rows), figure(rows))

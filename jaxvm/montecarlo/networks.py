@@ -24,6 +24,7 @@ from jaxvm.network.draw import Noise, drawn, with_measurements
 from jaxvm.network.network import Network
 from jaxvm.network.scene import Scene
 from jaxvm.network.state import State
+from jaxvm.recording.write import model_text
 from jaxvm.solve.adjust import degrees_of_freedom
 from jaxvm.solve.arrow import Arrow, factorise
 from jaxvm.solve.gauge import check_gauge
@@ -140,12 +141,21 @@ def network_study(
     problem = in_levels(problem)
     trial = NetworkTrial(problem, quantity, estimator, noise, truth, source, sigma)
     about = {"kind": "network", "noise": name_of(noise), "estimator": name_of(estimator)}
+    about["model"] = _model_text(scene)
     return NetworkStudy(
         trial,
         about | {"numbers": fingerprint(trial)} | (told or {}),
         covariance=covariance,
         degrees_of_freedom=degrees_of_freedom(problem, normal.hessian.diagonal()),
     )
+
+
+def _model_text(scene: Scene) -> str:
+    """The scene's model as recording.toml has it; empty where the format can't say it."""
+    try:
+        return model_text(scene.model)
+    except ValueError:
+        return ""
 
 
 class Spread(eqx.Module):

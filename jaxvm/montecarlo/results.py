@@ -8,11 +8,14 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 from jaxtyping import Float, Int
 
 from jaxvm.montecarlo.statistics import Statistics
 from jaxvm.montecarlo.store import Store, columns_of, trial_of
 from jaxvm.montecarlo.trials import Trial
+from jaxvm.recording.files import json_text
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,17 +125,21 @@ class Results:
         for group, values in (("error", found.error), ("sigma", found.sigma)):
             for name, own in values.items():
                 variables[f"{group}_{name}"] = (("trial", f"{name}_component"), own)
-        return xarray.Dataset(variables, {"trial": numbers}, {"study": str(self.about)})
+        return xarray.Dataset(variables, {"trial": numbers}, {"study": json_text(self.about)})
 
     def save(self, path: str | Path) -> Path:
         """Write all trials to one file, `.parquet` or `.nc` (NetCDF).
+
+        The file tells the study (a network's model among it), its key and what versions computed
+        it: JSON under "study" in the metadata of the table, or in the attributes of the dataset.
 
         Raises:
             ValueError: another kind of file.
         """
         path = Path(path)
         if path.suffix == ".parquet":
-            self.frame().to_parquet(path, index=False)
+            table = pa.table(self.columns)
+            pq.write_table(table.replace_schema_metadata({"study": json_text(self.about)}), path)
         elif path.suffix == ".nc":
             self.to_xarray().to_netcdf(path, engine="h5netcdf")
         else:

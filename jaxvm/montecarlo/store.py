@@ -143,6 +143,7 @@ def _parts(manifest: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """What computed: the package, JAX, NumPy, Python."""
-    found = {name: version(name) for name in ("jax", "numpy")}
+    """What computed: the package, what it computes with, Python."""
+    computing = "jax", "jaxlib", "equinox", "optimistix", "lineax", "numpy"
+    found = {name: version(name) for name in computing}
     return {"jaxvm": __version__, **found, "python": platform.python_version()}
