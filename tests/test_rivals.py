@@ -154,6 +154,39 @@ def test_the_forms_of_a_name_share_its_prior_and_add_up(warmed, monkeypatch):
     assert all(not r.others for r in others)
 
 
+def test_plausibility_is_no_matter_of_the_noise(warmed):
+    """Of two that fit alike the less plausible is as much less likely, however loud the noise."""
+    bend = 2.0 * effect_deviations(fitted(warmed, 0.0)[-1].adjustment)[-1][1]
+    parts, plain, tests, found = fitted(warmed, bend)
+    own, amplitudes = found.hypothesis, found.amplitudes
+    key, share = own.entries[0].id, own.alternatives[own.entries[0].id]
+    rare = replace(own, scope=Scope(camera=("rare",)), alternatives={key: 2 * share})
+    # Its evidence is behind by its price alone.
+    shown = [(rare, amplitudes, 2.0 * np.log(2.0))]
+    for noise in (1.0, 6.0):
+        asked = (plain, found.adjustment, own, found.effect, tests, parts.n)
+        _, others = rivals(*asked, shown, noise)
+        (found_odds,) = [r.log_odds for r in others if r.hypothesis.scope.camera == ("rare",)]
+        assert found_odds == pytest.approx(-np.log(2.0), abs=1e-9)
+
+
+def test_what_is_remembered_is_not_counted_twice(warmed):
+    """Rivals of the same fit weigh the same when they are told what they were."""
+    bend = 2.0 * effect_deviations(fitted(warmed, 0.0)[-1].adjustment)[-1][1]
+    parts, plain, tests, found = fitted(warmed, bend)
+    asked = (plain, found.adjustment, found.hypothesis, found.effect, tests, parts.n)
+    chief, others = rivals(*asked)
+    again, same = rivals(*asked, remembered=others)
+    assert again.weight == pytest.approx(chief.weight, rel=1e-9)
+    assert [r.weight for r in same] == pytest.approx([r.weight for r in others], rel=1e-9)
+    # What only they knew is still there.
+    odds = float(np.log(0.5))
+    known = replace(others[0].hypothesis, scope=Scope(camera=("elsewhere",)))
+    lone = replace(others[0], hypothesis=known, log_odds=odds)
+    _, more = rivals(*asked, remembered=[*others, lone])
+    assert ("elsewhere",) in [r.hypothesis.scope.camera for r in more]
+
+
 def _raised(instants, drops) -> np.ndarray:
     """Drops of ramps from some instants on, with the best one raised to the peak."""
     group = Group((Term("sensor.focal"),), "camera")

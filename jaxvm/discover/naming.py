@@ -127,10 +127,6 @@ class Naming:
         if hidden(current, findings, k):
             return finding
         without, tests = self._without(current, findings, k)
-        shown = [
-            (r.hypothesis, np.zeros(0), 2.0 * np.log(max(finding.weight, 1e-9) / r.weight))
-            for r in finding.rivals
-        ]
         chief, doubles = rivals(
             without,
             current,
@@ -138,8 +134,8 @@ class Naming:
             current.scene.fitted_effects()[given_effects(current, findings) + k],
             tests,
             self.parts.n,
-            shown,
-            finding.noise,
+            noise=finding.noise,
+            remembered=finding.rivals,
         )
         return replace(finding, weight=chief.weight, others=chief.others, rivals=tuple(doubles))
 

@@ -39,7 +39,8 @@ class Rival:
     Attributes:
         hypothesis: what it is.
         gap: by how much it is expected to be worse (chi-square).
-        weight: posterior weight among all doubles.
+        weight: posterior weight among all doubles, over all drivers and forms.
+        log_odds: of its best driver and form, against the chosen one.
         others: the same physics after other drivers, which it may follow as well.
         names: all that its combination may be called.
     """
@@ -49,6 +50,7 @@ class Rival:
     weight: float
     others: tuple[Hypothesis, ...] = ()
     names: tuple[str, ...] = ()
+    log_odds: float = 0.0
 
 
 @dataclass
@@ -87,6 +89,7 @@ def rivals(
     n: int,
     shown: Iterable[tuple[Hypothesis, np.ndarray, float]] = (),
     noise: float = 1.0,
+    remembered: Iterable[Rival] = (),
 ) -> tuple[Rival, list[Rival]]:
     """The chosen hypothesis among its rivals, which are sorted by weight.
 
@@ -101,6 +104,7 @@ def rivals(
         shown: hypotheses that the recording itself shows to be as good, with their amplitudes and
             by how much their evidence is behind in white noise.
         noise: by how much more than white noise it makes chi-square drop.
+        remembered: rivals that it had in another fit.
     """
     variance = noise * after.variance_factor
     change = stacked(before) - stacked(after)
@@ -118,14 +122,17 @@ def rivals(
     def weigh(hypothesis: Hypothesis, amplitudes: np.ndarray, gap: float, fit: float) -> None:
         names = tuple(entry.id for entry in hypothesis.entries)
         for named in _one_by_one(hypothesis):
-            odds = float(fit + log_prior(named, np.asarray(amplitudes)) - own_prior)
-            claim = claims.setdefault(claim_of(named), _Claim(named, names, gap, -np.inf))
-            if odds > claim.log_odds:
-                claim.hypothesis, claim.names = named, names
-                claim.gap, claim.log_odds = gap, odds
-            kind = named.course.driver, named.course.form
-            if kind not in claim.of_kind or odds > claim.of_kind[kind][0]:
-                claim.of_kind[kind] = odds, named
+            prior = log_prior(named, np.asarray(amplitudes)) - own_prior
+            count(named, names, gap, float(fit + prior))
+
+    def count(named: Hypothesis, names: tuple[str, ...], gap: float, odds: float) -> None:
+        claim = claims.setdefault(claim_of(named), _Claim(named, names, gap, -np.inf))
+        if odds > claim.log_odds:
+            claim.hypothesis, claim.names = named, names
+            claim.gap, claim.log_odds = gap, odds
+        kind = named.course.driver, named.course.form
+        if kind not in claim.of_kind or odds > claim.of_kind[kind][0]:
+            claim.of_kind[kind] = odds, named
 
     scene, found = before.scene, []
     # Neither is among the hypotheses that are scored together: what every image has for itself, and
@@ -150,10 +157,14 @@ def rivals(
             behind = shrunk * min(gap, limit) + max(gap - limit, 0.0)
             weigh(hypothesis, amplitudes, gap, -0.5 * (behind + cost))
     for hypothesis, amplitudes, in_white in shown:
-        behind = in_white / noise
+        # What is plausible beforehand is no matter of the noise, nor of how exact forms are.
+        prior = log_prior(hypothesis, np.asarray(amplitudes)) - own_prior
+        behind = (in_white + 2.0 * prior) / noise
         if behind <= limit and not hypothesis.same(own):
-            prior = log_prior(hypothesis, np.asarray(amplitudes)) - own_prior
-            weigh(hypothesis, amplitudes, max(behind, 0.0), -0.5 * shrunk * behind - prior)
+            weigh(hypothesis, amplitudes, max(behind, 0.0), -0.5 * shrunk * behind)
+    for rival in remembered:
+        if not rival.hypothesis.same(own):
+            count(rival.hypothesis, rival.names, rival.gap, rival.log_odds)
     weigh(own, own_amplitudes, 0.0, 0.0)
 
     total = np.logaddexp.reduce([claim.weight for claim in claims.values()])
@@ -182,7 +193,7 @@ def _rival(claim: _Claim, weight: float, driver: str = "") -> Rival:
     ordered = claim.of_driver()
     least = ordered[0][0] - np.log(_ODDS)
     near = [h for odds, h in ordered if h.course.driver != first and odds > least]
-    return Rival(claim.hypothesis, claim.gap, weight, tuple(near), claim.names)
+    return Rival(claim.hypothesis, claim.gap, weight, tuple(near), claim.names, claim.log_odds)
 
 
 def claim_of(hypothesis: Hypothesis) -> tuple:
