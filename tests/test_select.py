@@ -1,18 +1,28 @@
 """Names of a hypothesis: by size, one by one, and not for what an unnamed effect left over."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 from networks import board_recording, predicted
 
-from jaxvm.discover.accept import STRONG
+from jaxvm.discover.accept import STRONG, _comparable
 from jaxvm.discover.constants import sensible
 from jaxvm.discover.courses import Course
 from jaxvm.discover.diagnose import _plain_fit
 from jaxvm.discover.groups import Group
 from jaxvm.discover.hypotheses import Hypothesis
-from jaxvm.discover.select import best_named, evidence, identity, log_prior, refit
+from jaxvm.discover.select import (
+    Candidate,
+    best_named,
+    evidence,
+    identity,
+    log_prior,
+    price,
+    price_of_columns,
+    price_of_constants,
+    refit,
+)
 from jaxvm.physics.catalogue import entries_for
 from jaxvm.physics.catalogue.entry import each
 from jaxvm.physics.effects import Effect, Scope, Term
@@ -177,6 +187,59 @@ def test_what_stands_still_for_its_dead_time_is_a_constant(share, sound):
     assert sensible(scene, late) == sound
     # Nothing is known of the course while it has no size.
     assert sensible(scene, replace(late, amplitudes=(0.0,)))
+
+
+def test_a_curve_in_time_is_sensible_though_its_knots_begin_before_the_recording():
+    scene = board_recording().true_scene()
+    time = np.asarray(scene.network.channels.epoch_time)
+    spacing = float(np.ptp(time)) / 9.0
+    own = FORMS["curve"]
+    curve = Effect(
+        "it moves",
+        (Term("mount.shift_x"),),
+        driver="time",
+        form="curve",
+        constants=(float(time[0]) - spacing, spacing),
+        scope=Scope(camera=("cam",)),
+        amplitudes=tuple(1e-4 * np.arange(len(own.bases))),
+    )
+    assert curve.constants[0] < 0.0 and not own.constants[0].refined
+    assert sensible(scene, curve)
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """Of a fit, what it costs and leaves."""
+
+    cost: float
+    variance_factor: float
+
+
+def test_candidates_are_compared_at_one_variance():
+    """2 ln of the likelihood ratio of two fits is n ln of the ratio of what they leave."""
+    n, before, left = 1000, 10_000.0, np.array([1010.0, 1000.0])
+    current = Fitted(0.5 * before, before / n)
+    candidates = [
+        Candidate(DRIFT, Fitted(0.5 * chi2, chi2 / n), (before - chi2) / (chi2 / n))  # pyright: ignore[reportArgumentType]
+        for chi2 in left
+    ]
+    best, other = _comparable(candidates, current)  # pyright: ignore[reportArgumentType]
+    assert best.adjustment.cost == 500.0
+    assert best.evidence - other.evidence == pytest.approx(n * np.log(1.01), rel=0.02)
+
+
+def test_constants_cost_the_same_when_they_are_taken_and_when_they_are_kept():
+    """A refined constant never costs more than a column, and one that any value does nothing."""
+    lagging = replace(DRIFT, course=Course("body_degC", "lag", (600.0,)))
+    n = 40_000
+    assert price_of_constants(DRIFT, 50.0, n) == 0.0
+    assert price_of_constants(lagging, 1e-9, n) == pytest.approx(0.0, abs=1e-6)
+    assert 0.0 < price_of_constants(lagging, 28.0, n) < np.log(n)
+    assert price_of_constants(lagging, 1e12, n) == pytest.approx(np.log(n))
+    columns = price_of_columns(lagging, np.ones(1), 28.0, n)
+    prior = 2.0 * log_prior(lagging, np.ones(1))
+    whole = price(lagging, 28.0, np.ones(1), n)
+    assert whole == pytest.approx(columns + price_of_constants(lagging, 28.0, n) - prior)
 
 
 def test_depths_of_marks_do_not_run_away_with_the_poses():

@@ -97,7 +97,8 @@ def accept(
                 hopeless.add(key)
             else:
                 refitted.append(candidate)
-        for candidate in sorted(refitted, key=lambda c: -_common_evidence(c, refitted, current)):
+        refitted = _comparable(refitted, current)
+        for candidate in refitted:
             shown = split.evaluate(candidate.adjustment.scene)
             proof = gain(heldout, shown, seed)
             strong = candidate.evidence > STRONG and _is_foretold(candidate)
@@ -108,10 +109,10 @@ def accept(
                 gap = max(_OPEN[0], _OPEN[1] * abs(candidate.evidence))
                 others = tuple(
                     c
-                    for c in sorted(refitted, key=lambda c: -c.evidence)
+                    for c in refitted
                     if c is not candidate and candidate.evidence - c.evidence < gap
                 )
-                return Accepted(candidate, others, shown, proof, tuple(tried))
+                return Accepted(candidate, others, shown, proof, tuple(_comparable(tried, current)))
             hopeless.add((identity(candidate.hypothesis), candidate.hypothesis.course))
     return short(leading[0][0])
 
@@ -144,17 +145,25 @@ def _least(hypothesis: Hypothesis) -> float:
     return _FREE_LEAST_OF_EPOCHS if of_epochs else _FREE_LEAST
 
 
-def _common_evidence(candidate: Candidate, all_candidates, current: Adjustment) -> float:
-    """Evidence with one variance for all candidates: the smallest that any of them reaches."""
-    variance = min(c.adjustment.variance_factor for c in all_candidates)
-    own = candidate.adjustment.variance_factor
-    drop = 2.0 * (current.cost - candidate.adjustment.cost)
-    return candidate.evidence + drop * (1.0 / variance - 1.0 / own)
+def _comparable(candidates: list[Candidate], current: Adjustment) -> list[Candidate]:
+    """Candidates with their evidence for one variance, the least that any reaches, best first.
+
+    By its own variance what fits worse is behind by the drop of all times the difference, too.
+    """
+    variance = min((c.adjustment.variance_factor for c in candidates), default=1.0)
+
+    def common(candidate: Candidate) -> Candidate:
+        drop = 2.0 * (current.cost - candidate.adjustment.cost)
+        more = drop * (1.0 / variance - 1.0 / candidate.adjustment.variance_factor)
+        return replace(candidate, evidence=candidate.evidence + more)
+
+    return sorted(map(common, candidates), key=lambda c: -c.evidence)
 
 
 def alternatives(accepted: Accepted, leading) -> tuple[Hypothesis, ...]:
     """What was refitted, and what else led with few columns, if it was not far behind."""
-    best = accepted.chosen.evidence
+    chosen = accepted.chosen.hypothesis
+    best = next(c.evidence for c in accepted.tried if c.hypothesis.same(chosen))
     tried = [c.hypothesis for c in accepted.tried if c.evidence > _HOPEFUL * best]
     least = _HOPEFUL * leading[0][1]
     others = [h for h, own, amplitudes in leading if len(amplitudes) <= FREE and own > least]

@@ -13,7 +13,13 @@ from jaxvm.discover.constants import sensible
 from jaxvm.discover.diagnosis import Finding
 from jaxvm.discover.hypotheses import FREE, Hypothesis
 from jaxvm.discover.rivals import Rival
-from jaxvm.discover.select import price, price_of_columns, spread_of, with_spread
+from jaxvm.discover.select import (
+    price,
+    price_of_columns,
+    price_of_constants,
+    spread_of,
+    with_spread,
+)
 from jaxvm.network.scene import Scene
 from jaxvm.physics.effects import Effect, room_for
 from jaxvm.solve.adjust import Adjustment
@@ -196,7 +202,11 @@ def likelier(
     if not tried.converged:
         return current, findings
     before = Rival(finding.hypothesis, 0.0, finding.weight, finding.others)
-    others = [rival for rival in (*finding.rivals, before) if rival is not best]
+    others = [
+        replace(rival, log_odds=rival.log_odds - best.log_odds)
+        for rival in (*finding.rivals, before)
+        if rival is not best
+    ]
     leading = replace(
         finding,
         hypothesis=best.hypothesis,
@@ -241,7 +251,7 @@ def _worth(current: Adjustment, findings: list[Finding], n: int) -> list[tuple[f
         effect, drop = finding.effect, wald_drops(current, [own], spread)[0] / variance
         known = variance * spread[np.ix_(own, own)]
         columns = price_of_columns(finding.hypothesis, effect.amplitudes, drop, n, known)
-        found.append((drop, columns + len(effect.constants) * float(np.log(n))))
+        found.append((drop, columns + price_of_constants(finding.hypothesis, drop, n)))
     return found
 
 

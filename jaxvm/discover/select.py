@@ -175,16 +175,21 @@ def evidence(
 def price(
     hypothesis: Hypothesis, drop: float, amplitudes, n: int, spread: np.ndarray | None = None
 ) -> float:
-    """What a hypothesis costs: columns, constants, implausibility (on the scale of chi-square).
+    """What a hypothesis costs: columns, constants, implausibility (on the scale of chi-square)."""
+    columns = price_of_columns(hypothesis, amplitudes, drop, n, spread)
+    constants = price_of_constants(hypothesis, drop, n)
+    return columns + constants - 2.0 * log_prior(hypothesis, np.asarray(amplitudes))
 
-    Each constant that is refined costs what the drop lets it be known by (Laplace): next to nothing
-    where any value does, as much as a column where one value alone does.
+
+def price_of_constants(hypothesis: Hypothesis, drop: float, n: int) -> float:
+    """What the constants of a hypothesis cost.
+
+    Each that is refined costs what the drop lets it be known by (Laplace): next to nothing where
+    any value does, as much as a column where one value alone does.
     """
     own = FORMS[hypothesis.course.form].constants[: len(hypothesis.course.constants)]
     refined = min(np.log1p(_SHARP * max(drop, 0.0)), np.log(n))
-    constants = sum(refined if constant.refined else np.log(n) for constant in own)
-    prior = log_prior(hypothesis, np.asarray(amplitudes))
-    return price_of_columns(hypothesis, amplitudes, drop, n, spread) + constants - 2.0 * prior
+    return float(sum(refined if constant.refined else np.log(n) for constant in own))
 
 
 def spread_of(
