@@ -2,9 +2,14 @@
 
 from dataclasses import dataclass, replace
 
+import numpy as np
 import pytest
 
+from jaxvm.discover.courses import Course
 from jaxvm.discover.doubt import DOUBT, doubted
+from jaxvm.discover.groups import Group
+from jaxvm.discover.hypotheses import Family
+from jaxvm.discover.ranking import Ranking, Scores
 from jaxvm.physics.catalogue.entry import each
 from jaxvm.physics.effects import Effect, Scope, Term
 
@@ -88,3 +93,35 @@ def test_two_that_never_change_are_not_one_course():
 
 def test_a_free_form_that_explains_more_leaves_no_name_sure():
     assert weights(WARMS, replace(JUMPS, scope=RIGHT), drops=[10.0, 100.0])[0] == 1.0 - DOUBT
+
+
+def test_what_is_left_at_many_ports_is_one_family():
+    """Two hundred repetitions, forty groups: what none of them gives is as rare as one in 200."""
+    n_groups, repetitions = 40, 199
+    groups = tuple(
+        Group((Term("sensor.focal", f"pattern {k}"),), "camera") for k in range(n_groups)
+    )
+    family = Family(
+        groups=groups,
+        courses=(Course("constant", "constant"),),
+        scopes=(LEFT, RIGHT),
+        valid=np.ones((n_groups, 1, 2), bool),
+        kinds=("constant",),
+        asked=(1,),
+        named={},
+    )
+    null = np.random.default_rng(0).chisquare(1, (n_groups, repetitions))
+    z = np.full((n_groups, 1, 2), 1.0)
+    shape = (n_groups, 1, 2)
+
+    def left(largest: float, scope: Scope = LEFT) -> float:
+        own = z.copy()
+        own[7, 0, 0] = largest
+        scores = Scores(family, own, own, own[..., None], own, null, np.ones(shape, bool), 1.0)
+        return Ranking((scores,), null.max(axis=0)).left_at({"sensor.focal"}, scope)
+
+    assert left(1e3) == 1.0 / (repetitions + 1)
+    # The largest of forty, half of the time.
+    assert left(float(np.median(null.max(axis=0)))) == pytest.approx(0.5, abs=0.02)
+    assert left(1e3, RIGHT) > 0.9
+    assert left(1e3, Scope(camera=("none",))) == 1.0

@@ -69,15 +69,16 @@ class Ranking:
         The family is that of the hypotheses about these ports, of any course: what the best course
         of its kind should have explained.
         """
-        p, families = 1.0, 0
+        largest, nulls = -np.inf, []
         for scores in self.scores:
+            own = [s for s, other in enumerate(scores.family.scopes) if other == scope]
             for g, group in enumerate(scores.family.groups):
-                own = [s for s, other in enumerate(scores.family.scopes) if other == scope]
                 z = np.where(scores.valid[g][:, own], scores.z[g][:, own], -np.inf)
                 if {term.port for term in group.terms} <= ports and np.isfinite(z).any():
-                    p = min(p, _p_value(z.max(), scores.null[g]))
-                    families += 1
-        return min(p * max(families, 1), 1.0)
+                    largest = max(largest, float(z.max()))
+                    nulls.append(scores.null[g])
+        # Each repetition has one largest value of all of them, as the family of everything has.
+        return _p_value(largest, np.max(nulls, axis=0)) if nulls else 1.0
 
     def left_in_harmonics(self, effect: Effect) -> float:
         """Probability that noise alone gives what is left at a half and a third of a period.
