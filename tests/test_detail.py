@@ -61,6 +61,13 @@ def test_a_dented_plate_gets_a_fine_map():
     assert only.drop == pytest.approx(sum(f.drop for f in findings))
     assert only.others == () and only.rivals == ()
     assert shown.rms_px < 0.97 * coarse.rms_px < before.rms_px
+    # Its proof is that of all that it explains: from nothing to the map.
+    assert (only.gain.before_px, only.gain.after_px) == (
+        pytest.approx(before.rms_px, rel=0.01),
+        shown.rms_px,
+    )
+    share = 1.0 - (only.gain.after_px / only.gain.before_px) ** 2
+    assert only.gain.share == pytest.approx(share, abs=0.02)
     assert np.all(np.isfinite(only.stds)) and len(only.stds) == only.effect.n_columns
     # As far as it can be known: photographs of a plate without dents leave no less.
     noise = np.sqrt(robust_variance(fitted)) * reference_sigma(fitted.scene)

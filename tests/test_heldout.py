@@ -12,7 +12,7 @@ from jaxvm.discover.accept import STRONG, _is_determined, _is_foretold, accept
 from jaxvm.discover.courses import Course
 from jaxvm.discover.diagnose import _plain_fit
 from jaxvm.discover.groups import Group
-from jaxvm.discover.heldout import gain, weights_of
+from jaxvm.discover.heldout import HeldOut, gain, weights_of
 from jaxvm.discover.hypotheses import Hypothesis
 from jaxvm.discover.select import refit
 from jaxvm.physics.catalogue import entries_for
@@ -199,3 +199,10 @@ def test_an_image_that_was_never_taken_needs_no_amount():
 def drawn_odds(known, per_second, seed):
     parts, before, after, _ = drawn(known, per_second, seed)
     return odds(parts, before, after)
+
+
+def test_where_nothing_was_held_out_nothing_is_proven(known):
+    nothing = np.zeros(0)
+    before = HeldOut(0.0, nothing, nothing, 0.0, known.true_scene())
+    found = gain(before, replace(before, range_square=-1.0))
+    assert not found.proven and found.probability == 0.0 and found.share == 0.0

@@ -54,6 +54,8 @@ def with_detail(
             proof = gain(heldout, shown, seed)
             if tried.failed or not proof.proven:
                 continue
+            # What the map explains is what nothing did without any of its members.
+            bare = current.scene.with_effects(others, current.scene.room)
             strongest = max(members, key=lambda f: f.drop)
             effect = tried.scene.fitted_effects()[-1]
             found = replace(
@@ -67,7 +69,7 @@ def with_detail(
                 rivals=(),
                 drop=sum(f.drop for f in members),
                 after=parts.residuals(tried),
-                gain=replace(members[0].gain, after_px=shown.rms_px),
+                gain=gain(parts.proven(parts.fit(bare))[1], shown, seed),
             )
             current, heldout = tried, shown
             findings = [*(findings[k] for k in kept), found]

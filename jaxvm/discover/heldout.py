@@ -268,8 +268,13 @@ def _amplitudes(scene: Scene, n_epochs: int) -> np.ndarray:
 
 
 def gain(before: HeldOut, after: HeldOut, seed: int = 0, repetitions: int = 2000) -> Gain:
-    """Improvement with an interval from a bootstrap over held-out epochs."""
+    """Improvement with an interval from a bootstrap over held-out epochs.
+
+    Where nothing was held out (fewer epochs than every third one needs) nothing is proven.
+    """
     n = len(before.square)
+    if not before.count.sum():
+        return Gain(before.rms_px, after.rms_px, 0.0, (0.0, 0.0), 0.0)
     picks = np.random.default_rng(seed).integers(0, n, (repetitions, n))
     per_epoch = 1.0 / max(n, 1)
     old = before.square + before.range_square * per_epoch
