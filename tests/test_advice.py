@@ -561,3 +561,47 @@ def test_a_plan_needs_what_it_changes(stereo, frontal):
     # In so much noise no plan is sure, and all that are possible are weighed.
     keys = {a.plan.key for a in advise(stereo, ones(stereo), 0, as_rivals(SHIFT), 1e9)}
     assert keys == set(could)
+
+
+# --- plans do what their words say ----------------------------------------------------------------
+
+
+def test_twice_as_long_is_half_as_fast(stereo):
+    recording = stereo.recording
+    changed = PLAN["longer"].recording(recording)
+    np.testing.assert_allclose(np.ptp(changed.time), 2.0 * np.ptp(recording.time))
+    for name, values in recording.velocities.items():
+        np.testing.assert_allclose(changed.velocities[name], 0.5 * values)
+
+
+def test_what_is_switched_on_again_runs_from_its_last_moment(stereo):
+    recording = stereo.recording
+    first, last = recording.time[[0, -1]]
+    often = (float(first) - 5.0, float(last) - 1e-3)
+    cameras = tuple(replace(c, powered_on_s=often) for c in recording.model.cameras)
+    recording = replace(recording, model=replace(recording.model, cameras=cameras))
+    changed = PLAN["restart"].recording(recording)
+    for camera in changed.model.cameras:
+        assert camera.powered_on_s == tuple(sorted((*often, 0.5 * (first + last))))
+
+
+def test_what_is_carried_by_a_station_can_not_be_put_nearer(stereo):
+    recording = stereo.recording
+    assert possible(PLAN["nearer"], recording)
+    station = recording.model.stations[0].name
+    targets = tuple(replace(t, station=station) for t in recording.model.targets)
+    carried = replace(recording, model=replace(recording.model, targets=targets))
+    assert not possible(PLAN["nearer"], carried)
+
+
+def test_a_cycle_returns_while_images_are_taken(stereo):
+    """The log may begin a day before the first image and end a day after the last."""
+    recording = stereo.recording
+    first, last = recording.time[[0, -1]]
+    span = last - first
+    log = np.linspace(first - 20.0 * span, last + 20.0 * span, 2001)
+    warm = 20.0 + np.sin(log / span)
+    changed = PLAN["cycle"].recording(replace(recording, drivers=Drivers(log, {"body_degC": warm})))
+    course = np.interp(np.linspace(first, last, 50), log, changed.drivers.channels["body_degC"])
+    assert np.ptp(course) == pytest.approx(2.0 * np.ptp(warm), rel=0.05)
+    assert abs(course[-1] - course[0]) < 0.05 * np.ptp(course)

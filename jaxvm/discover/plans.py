@@ -21,6 +21,7 @@ from jaxvm.network.views import rays_of_pixels
 from jaxvm.physics.drivers import air_and_bodies, channel_kind
 from jaxvm.recording import Drivers, Recording
 from jaxvm.recording.join import PAUSE_S
+from jaxvm.recording.model import Target
 
 _SAME_RAY_RAD = 0.02
 """Angle within which the ray of a pixel leads to its mark: far more than an effect turns it."""
@@ -121,7 +122,9 @@ def _cycle(recording: Recording) -> Recording:
     drivers = recording.drivers
     assert drivers is not None
     time, channels = drivers.time, dict(drivers.channels)
-    share = (time - time[0]) / max(time[-1] - time[0], 1e-9)
+    # The log may begin long before the first image.
+    first, last = recording.time[[0, -1]]
+    share = (time - first) / max(last - first, 1e-9)
     up = np.clip(np.minimum(share / 0.3, (0.8 - share) / 0.3), 0.0, 1.0)
     air, bodies = air_and_bodies(channels)
     led = bodies if air else ()
@@ -168,7 +171,7 @@ def _reversed(recording: Recording) -> Recording:
 def _restarted(recording: Recording) -> Recording:
     middle = float(0.5 * (recording.time[0] + recording.time[-1]))
     cameras = tuple(
-        replace(c, powered_on_s=(*c.powered_on_s, middle)) if c.powered_on_s else c
+        replace(c, powered_on_s=tuple(sorted((*c.powered_on_s, middle)))) if c.powered_on_s else c
         for c in recording.model.cameras
     )
     return replace(recording, model=replace(recording.model, cameras=cameras))
@@ -183,7 +186,8 @@ def _longer(recording: Recording) -> Recording:
     drivers = recording.drivers
     if drivers is not None:
         drivers = replace(drivers, time=later(drivers.time))
-    return replace(recording, time=later(recording.time), drivers=drivers)
+    slower = {name: 0.5 * values for name, values in recording.velocities.items()}
+    return replace(recording, time=later(recording.time), drivers=drivers, velocities=slower)
 
 
 PLANS: tuple[Plan, ...] = (
@@ -211,7 +215,7 @@ PLANS: tuple[Plan, ...] = (
 def possible(plan: Plan, recording: Recording) -> bool:
     """Whether a plan can be made with what a recording has."""
     if plan.poses is not None:
-        return any(target.motion == "per-epoch" for target in recording.model.targets)
+        return any(map(_moves, recording.model.targets))
     if plan.key == "cycle":
         return recording.drivers is not None and any(map(_warms, recording.drivers.channels))
     if plan.key == "reverse":
@@ -219,6 +223,11 @@ def possible(plan: Plan, recording: Recording) -> bool:
     if plan.key == "restart":
         return any(camera.powered_on_s for camera in recording.model.cameras)
     return recording.timed
+
+
+def _moves(target: Target) -> bool:
+    """Whether a target goes where one likes: in the world, for itself, and not on a station."""
+    return target.motion == "per-epoch" and not target.station
 
 
 def planned(plan: Plan, scene: Scene, another_day: bool = False) -> Planned:
@@ -284,7 +293,7 @@ def _with_poses(plan: Plan, scene: Scene):
     assert plan.poses is not None
     table = np.array(scene.state.carrier_from_target)
     targets = enumerate(scene.model.targets)
-    moving = [i for i, t in targets if t.motion == "per-epoch" and not t.station]
+    moving = [i for i, target in targets if _moves(target)]
     rows = scene.target_row[moving]
     up = np.asarray(scene.model.up, float)
     middles = [scene.model.targets[i].points for i in moving]
