@@ -58,3 +58,16 @@ def test_whatever_is_late_has_a_course_like_it(grid, truth, late):
             best = max(best, 1.0 - float(left @ left) / float(own @ own))
     # A refit finds the dead time from as far as that.
     assert best > (0.85 if truth == "delay" else 0.93)
+
+
+@pytest.mark.parametrize("n_epochs", [6, 7, 8, 40])
+def test_no_course_is_asked_twice(n_epochs):
+    """Of a handful of epochs, too, whose third is shorter than two spacings."""
+    known = board_recording(n_epochs=n_epochs)
+    at = EVERY_S * np.arange(n_epochs)
+    drivers = Drivers(at, {AIR: 20.0 + np.sqrt(at)})
+    recording = replace(known.recording, time=at, drivers=drivers)
+    courses = enumerate_courses(known.true_scene(recording))
+    lags = [c.constants[0] for c in courses if (c.driver, c.form) == (AIR, "transient with state")]
+    assert lags == sorted(lags) and lags[-1] == pytest.approx(EVERY_S * (n_epochs - 1) / 3.0)
+    assert len(set(courses)) == len(courses)

@@ -1,16 +1,17 @@
 """Single wrong marks are set aside, all of them and no others; physics is not."""
 
 import importlib
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 from networks import board_recording, predicted
 
-from jaxvm.discover.diagnose import _searched
+from jaxvm.discover.diagnose import _laid_bare, _searched
 from jaxvm.discover.gross import without_gross_errors
-from jaxvm.discover.heldout import hold_out, split
+from jaxvm.discover.heldout import Split, hold_out, split
 from jaxvm.physics.effects import Effect, Scope, Term
+from jaxvm.solve.adjust import Adjustment
 
 N_EPOCHS = 30
 
@@ -90,6 +91,22 @@ def test_sound_marks_all_stay(known):
     assert count == 0
     assert fitted is first and parts is all_parts
     assert abs(fitted.variance_factor - 1.0) < 4.0 * np.sqrt(2.0 / fitted.degrees_of_freedom)
+
+
+def test_errors_that_are_set_aside_are_not_laid_bare_again(known):
+    pixel = known.recording.observations.pixel.copy()
+    pixel[[100, 500]] += 20.0
+    _, (fitted, parts, count) = cleaned(known, pixel)
+    assert count == 2
+
+    @dataclass
+    class Found:
+        current: Adjustment
+        parts: Split
+        findings: tuple = ("one",)
+
+    same, new = _laid_bare(Found(fitted, parts))  # pyright: ignore[reportArgumentType]
+    assert new == 0 and same is parts
 
 
 @pytest.mark.parametrize("beginnings", [2, 1])

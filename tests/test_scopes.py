@@ -7,7 +7,7 @@ import pytest
 from networks import predicted, stereo_recording
 
 from jaxvm.discover.heldout import Split, range_weights_of, weights_of
-from jaxvm.discover.scopes import merged, sharing
+from jaxvm.discover.scopes import sharing
 from jaxvm.physics.effects import Effect, Scope, Term
 
 ROOM = (16, 4)
@@ -60,11 +60,18 @@ def test_both_alike(known):
     assert found.homogeneous and found.has_it == (True, True)
     assert "all cameras have it alike" in found.words()
     assert np.abs((found.amplitudes - 2e-3) / found.stds).max() < 4.0
-    shared = merged(result.scene.fitted_effects()[0], found)
-    assert shared.scope.camera == BOTH
     # Together they are known better than each alone, and in between.
     together = result.scene.fitted_effects()[0].amplitudes[0]
     assert found.amplitudes.min() <= together <= found.amplitudes.max()
+
+
+def test_noise_that_inflates_makes_bodies_more_alike(known):
+    """What differs by a few of its standard deviations is alike in noise with a memory."""
+    result, parts = fitted_to(known, (grows(2e-3, *BOTH),), grows(0.0, *BOTH))
+    white, louder = sharing(result, 0, parts), sharing(result, 0, parts, 9.0)
+    assert white is not None and louder is not None
+    np.testing.assert_allclose(louder.stds, 3.0 * white.stds, rtol=1e-6)
+    assert louder.equal > white.equal
 
 
 def test_a_finding_in_one_camera_is_found_in_both(known):

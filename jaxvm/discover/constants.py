@@ -43,7 +43,11 @@ def sensible(scene: Scene, effect: Effect) -> bool:
     if effect.form == "settling" and effect.constants[1] < np.median(np.diff(time)):
         return False
     for constant, value in zip(FORMS[effect.form].constants, effect.constants, strict=True):
-        if not np.isfinite(value) or value <= 0.0:
+        if not np.isfinite(value):
+            return False
+        if not constant.refined:
+            continue
+        if value <= 0.0:
             return False
         if constant.unit == "s" and value > 3.0 * span:
             return False

@@ -101,7 +101,10 @@ def enumerate_courses(scene: Scene) -> list[Course]:
     if len(channels.epoch_time) < _FEWEST_EPOCHS:
         return courses
     span = longest_session(channels)
-    lags = np.geomspace(max(2 * _spacing(channels), span / 200), span / 3, 6).tolist()
+    longest = span / 3
+    # A third of a handful of epochs is less than two spacings.
+    shortest = min(max(2 * _spacing(channels), span / 200), longest / 2)
+    lags = np.geomspace(shortest, longest, 6).tolist()
     for driver, kind in zip(channels.names, channels.kinds, strict=True):
         if kind in _OF_KIND:
             courses += _OF_KIND[kind](driver, channels, lags)

@@ -17,7 +17,7 @@ GROSS = 12.0
 """Residuals beyond this many robust standard deviations are mistakes, not physics."""
 
 ISOLATED = 0.25
-"""Largest share of a mark's epochs, or of an image's marks, that may be mistakes."""
+"""Share of a mark's epochs, or of an image's marks, from which on they are no mistakes."""
 
 _ROUNDS = 6
 

@@ -10,7 +10,6 @@ import numpy as np
 from scipy.stats import f as fisher
 
 from jaxvm.network.scene import Scene
-from jaxvm.solve.adjust import Adjustment
 
 
 @dataclass(frozen=True)
@@ -128,8 +127,3 @@ def _target_ring(scene: Scene, table: ResidualTable) -> np.ndarray:
         half = np.where(np.ptp(points, axis=0) > 0, np.ptp(points, axis=0) / 2, 1.0)
         outer.append(np.abs((points - centre) / half).max(axis=1) > 0.7)
     return np.concatenate(outer).astype(int)[scene.first_point[table.target] + table.point]
-
-
-def excess(adjustment: Adjustment, variance: float) -> float:
-    """Chi-square beyond its degrees of freedom, for a given variance of unit weight."""
-    return 2.0 * adjustment.cost / variance - adjustment.degrees_of_freedom

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from jaxvm.discover.heldout import Split
 from jaxvm.network.scene import Scene
-from jaxvm.physics.effects import Effect, Scope, room_for
+from jaxvm.physics.effects import Scope, room_for
 from jaxvm.solve.adjust import Adjustment
 from jaxvm.solve.covariance import amplitude_covariance
 
@@ -55,7 +55,7 @@ class Sharing:
         return f"no single {self.kind} has it for sure"
 
 
-def sharing(fitted: Adjustment, place: int, split: Split) -> Sharing | None:
+def sharing(fitted: Adjustment, place: int, split: Split, noise: float = 1.0) -> Sharing | None:
     """How the bodies of its kind share the effect at `place`.
 
     None where there is only one body, or where the scene has no room for an effect of each: a wider
@@ -65,6 +65,7 @@ def sharing(fitted: Adjustment, place: int, split: Split) -> Sharing | None:
         fitted: a fit with the effect in.
         place: number of the effect in its scene.
         split: what is fitted.
+        noise: by how much more than white noise it makes chi-square drop.
     """
     scene = fitted.scene
     effect = scene.fitted_effects()[place]
@@ -79,7 +80,7 @@ def sharing(fitted: Adjustment, place: int, split: Split) -> Sharing | None:
     apart = split.fit(scene.with_effects(effects, scene.room))
     if not apart.converged:
         return None
-    variance = apart.variance_factor
+    variance = noise * apart.variance_factor
     first = apart.scene.places()[len(others)][0].start
     n, m = len(names), effect.n_columns
     columns = np.arange(first, first + n * m)
@@ -119,8 +120,3 @@ def _bodies(scene: Scene, scope: Scope) -> tuple[str, tuple[str, ...]]:
     if len(kinds) != 1 or scope.point:
         return "", ()
     return kinds[0], tuple(body.name for body in of_kind[kinds[0]])
-
-
-def merged(effect: Effect, sharing: Sharing) -> Effect:
-    """The effect with the scope of all bodies that share it."""
-    return replace(effect, scope=Scope(**{sharing.kind: sharing.names}))
