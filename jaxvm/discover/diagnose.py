@@ -31,7 +31,7 @@ from jaxvm.discover.noise import Correlation, met
 from jaxvm.discover.scatter import ALIKE, likeness
 from jaxvm.discover.scopes import sharing
 from jaxvm.discover.search import ALPHA, Search
-from jaxvm.discover.visible import smallest_visible
+from jaxvm.discover.visible import absorbed, smallest_visible
 from jaxvm.network.scene import Scene, build
 from jaxvm.network.start import start
 from jaxvm.physics.effects import Effect, capacity
@@ -98,7 +98,7 @@ def diagnose(
     findings = _with_final_values(final, findings, len(effects), parts.sound)
     findings = [with_spread(f, own) for f, own in zip(findings, instants, strict=True)]
     findings = [
-        replace(f, sharing=sharing(current, len(effects) + k, parts))
+        replace(f, sharing=sharing(current, len(effects) + k, parts, f.noise))
         for k, f in enumerate(findings)
     ]
     if any(finding.rivals for finding in findings):
@@ -133,6 +133,7 @@ def diagnose(
         n_hypotheses=found.ranking.n,
         unproven=found.unproven,
         smallest=smallest_visible(found.ranking, robust_variance(current), current.scene),
+        absorbed=absorbed(found.first, scene),
         seconds=time.perf_counter() - began,
     )
 
@@ -200,11 +201,15 @@ def _searched(
 
 
 def _laid_bare(found: Search) -> tuple[Split, int]:
-    """The split without the gross errors that show beside what was found, and their number."""
+    """The split without the gross errors that show beside what was found, and their number.
+
+    0 where they are those that are set aside already.
+    """
     if not found.findings:
         return found.parts, 0
     _, cleaner, n = without_gross_errors(found.current, found.parts)
-    return cleaner, n
+    known = all(map(np.array_equal, cleaner.sound, found.parts.sound))
+    return (found.parts, 0) if known else (cleaner, n)
 
 
 def _plain_fit(scene: Scene, every: int) -> tuple[Split, Adjustment, int]:

@@ -103,6 +103,7 @@ class Diagnosis:
         n_hypotheses: hypotheses in the last round.
         unproven: the leading name for what is left, where it did not pass on held-out epochs.
         smallest: smallest amplitude that the recording could show, by catalogue entry.
+        absorbed: catalogue entries that it can't show, for the plain model's unknowns absorb them.
         seconds: wall time.
     """
 
@@ -129,4 +130,5 @@ class Diagnosis:
     n_hypotheses: int
     unproven: str
     smallest: dict[str, tuple[float, str]] = field(default_factory=dict)
+    absorbed: tuple[str, ...] = ()
     seconds: float = 0.0

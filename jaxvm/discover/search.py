@@ -65,6 +65,7 @@ class Search:
     p_value: float = 1.0
     unproven: str = ""
     ranking: Ranking = field(init=False)
+    first: Ranking = field(init=False)
     _weigh: Weighing = field(init=False)
     _tests: ScoreTests = field(init=False)
     _signs: np.ndarray = field(init=False)
@@ -83,7 +84,7 @@ class Search:
         They have the names under which they were found until the search is settled.
         """
         plain, heldout = self.current, self.heldout
-        first = self._search(most, progress)
+        first = self.first = self._search(most, progress)
         # What noise with a memory explains needs no other pair.
         confirmed = any(finding.p_value <= self.alpha for finding in self.findings)
         if confirmed and worth_a_second_thought(self.findings):
@@ -355,7 +356,9 @@ class Search:
         parts = self.parts
         # What a finding that goes had taken of the noise counts for the others again.
         while unconfirmed := [f.p_value for f in self.findings if f.p_value > self.alpha]:
-            self.p_value = min(unconfirmed)
+            # What is left and failed on the held-out epochs is as significant as before.
+            left = [self.p_value] if self.unproven else []
+            self.p_value = min([*unconfirmed, *left])
             self._drop_unconfirmed()
             self.current, self.heldout = parts.proven(self.current)
             self.findings = self._confirmed()

@@ -52,6 +52,7 @@ def document(diagnosis: Diagnosis) -> dict[str, Any]:
             name: {"amplitude": value, "unit": unit}
             for name, (value, unit) in sorted(diagnosis.smallest.items())
         },
+        "can_not_show": list(diagnosis.absorbed),
         "seconds": diagnosis.seconds,
     }
     return _plain(content)

@@ -10,6 +10,7 @@ from jaxvm import __version__
 from jaxvm.discover.diagnosis import Diagnosis
 from jaxvm.discover.shape import shape_words
 from jaxvm.network.estimate import estimated_model
+from jaxvm.physics.catalogue import BY_ID
 from jaxvm.recording.files import write_files
 from jaxvm.recording.write import model_text
 from jaxvm.report.document import document
@@ -83,6 +84,7 @@ def html(diagnosis: Diagnosis, pictures: dict[str, bytes]) -> str:
         verdict=verdict_sentence(diagnosis),
         picture=encoded,
         smallest=[(name, quantity(value, 0.0, unit)) for name, (value, unit) in smallest],
+        absorbed=[BY_ID[name].physics for name in diagnosis.absorbed],
         version=__version__,
         **words,
     )
