@@ -226,7 +226,8 @@ def best_by_name(
     evidence: dict[str, float] = {}
     for scores in ranking.scores:
         family = scores.family
-        values = np.where(scores.valid, scores.drop, -np.inf) / variance
+        # Between the points of a grid of constants, as the diagnosis itself sees its rivals.
+        values = family.at_peaks(np.where(scores.valid, scores.drop, -np.inf)) / variance
         for index in sorted(family.with_best_constants(values)):
             drop = float(values[index])
             entries = member(family, index, scene).entries
