@@ -1,4 +1,4 @@
-"""What benchmarks of growing problems write: exponents of time, results.json, .md and .png."""
+"""What benchmarks write: tables, exponents of time, results.json, results.md and results.png."""
 
 import json
 from pathlib import Path
@@ -15,9 +15,20 @@ def exponent(sizes, seconds) -> tuple[float, float]:
     return float(fit.slope), float(fit.stderr)
 
 
+def markdown(head: list[str], rows: list[list[Any]]) -> str:
+    """A table."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines) + "\n"
+
+
+def write_numbers(folder: Path, found: Any, table: str) -> None:
+    """Write the numbers and their table, and print it."""
+    (folder / "results.json").write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    (folder / "results.md").write_text(table, encoding="utf-8")
+    print(table)
+
+
 def write(folder: Path, found: dict[str, Any], table: str, figure: Figure) -> None:
     """Write the numbers, their table and their figure, and print the table."""
-    (folder / "results.json").write_text(json.dumps(found, indent=1) + "\n")
-    (folder / "results.md").write_text(table)
+    write_numbers(folder, found, table)
     figure.savefig(folder / "results.png", dpi=120)
-    print(table)

@@ -2,7 +2,7 @@
 
 Large station recordings of the sealed benchmark's independent world (two cameras, hours, reference
 and moving targets), each with one hidden effect or none. Each is diagnosed in one process that has
-diagnosed it once before; the second time counts.
+diagnosed it once before; the second time counts. results.json and results.md are written here.
 """
 
 import json
@@ -14,11 +14,12 @@ import time
 from pathlib import Path
 
 HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent / "sealed"))
+sys.path[:0] = [str(HERE.parent), str(HERE.parent / "sealed")]
 
 # jaxvm first, as in `jaxvm diagnose`: it sets the threads of NumPy's BLAS before NumPy is there.
 from jaxvm.discover import diagnose  # noqa: E402, I001
 from jaxvm.recording import read_recording  # noqa: E402
+from results import markdown, write_numbers  # noqa: E402
 from world import record  # noqa: E402
 
 HIDDEN = (
@@ -31,6 +32,26 @@ HIDDEN = (
     ("mount-creeps",),
 )
 """One recording each; none is drawn by what it takes."""
+
+
+def table(results: dict) -> str:
+    """results.md."""
+    rows = [
+        [
+            ", ".join(row["hidden"]) or "nothing",
+            f"{row['residuals']:,}",
+            f"{row['hypotheses']:,}",
+            f"{row['first_s']:.1f}",
+            f"{row['warm_s']:.1f}",
+            ", ".join(row["findings"]) or "nothing",
+        ]
+        for row in results["runs"]
+    ]
+    head = ["hidden", "residuals", "hypotheses", "first (s)", "warm (s)", "found"]
+    return (
+        f"{results['processors']} processors; median of the warm runs "
+        f"{results['median_s']:.1f} s.\n\n{markdown(head, rows)}"
+    )
 
 
 def main() -> None:
@@ -60,8 +81,7 @@ def main() -> None:
             print(json.dumps(rows[-1]), flush=True)
     warm = [row["warm_s"] for row in rows]
     results = {"runs": rows, "median_s": statistics.median(warm), "processors": os.cpu_count()}
-    (HERE / "results.json").write_text(json.dumps(results, indent=1) + "\n")
-    print(f"median {results['median_s']:.1f} s, largest {max(warm):.1f} s")
+    write_numbers(HERE, results, table(results))
 
 
 if __name__ == "__main__":

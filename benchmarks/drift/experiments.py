@@ -3,11 +3,12 @@
 `python benchmarks/drift/experiments.py`
 
 The world is that of `world.py` (four nodes, sun and wind). Writes experiments.json (size of the
-drift, time after which it falls below the noise in ten minutes, what a model leaves) and
-experiments.png.
+drift, time after which it falls below the noise in ten minutes, what a model leaves),
+results-experiments.md and experiments.png.
 """
 
 import json
+import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -15,11 +16,15 @@ from pathlib import Path
 import numpy as np
 from world import Made, draw_world, record
 
-from jaxvm.identify import identify
-from jaxvm.identify.maps import drift_map, settled_after
-from jaxvm.recording import Recording, read_recording
-
 HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parent))
+
+from results import markdown  # noqa: E402
+
+from jaxvm.identify import identify  # noqa: E402
+from jaxvm.identify.maps import drift_map, settled_after  # noqa: E402
+from jaxvm.recording import Recording, read_recording  # noqa: E402
+
 SEEDS = range(5)
 EXPERIMENTS = {
     "warm-up, 3 h": dict(style="room", hours=3.0, low=21.9, high=22.1, every=60.0, on_s=120.0),
@@ -35,6 +40,24 @@ def read(made: Made) -> Recording:
     with tempfile.TemporaryDirectory() as place:
         made.write(Path(place) / "recording")
         return read_recording(Path(place) / "recording")
+
+
+def table(results: list[dict]) -> str:
+    """results-experiments.md."""
+    rows = [
+        [
+            row["experiment"],
+            row["seed"],
+            f"{row['drift_rms_px']:.3f}",
+            f"{row['drift_range_px']:.3f}",
+            "never" if row["at_rest_after_min"] is None else f"{row['at_rest_after_min']:.0f} min",
+            row["structure"],
+            f"{row['foretold_px']:.4f}",
+        ]
+        for row in results
+    ]
+    head = ["experiment", "camera", "drift (px RMS)", "range (px)", "at rest after", "model"]
+    return markdown([*head, "error of foretold epochs (px)"], rows)
 
 
 def main() -> None:
@@ -90,6 +113,7 @@ def main() -> None:
         top.set(title=name, xlabel="hours", ylabel="mean drift (px): u —, v - -")
     drawn.savefig(HERE / "experiments.png", dpi=110)
     (HERE / "experiments.json").write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+    (HERE / "results-experiments.md").write_text(table(results), encoding="utf-8")
 
 
 if __name__ == "__main__":

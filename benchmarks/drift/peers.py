@@ -5,11 +5,12 @@
 Both learn from one recording of a world of `world.py`: ours as `jaxvm identify` does, N4SID from
 the same trajectories and inputs, in even steps, with the order from 1 to 6 whose simulation is best
 on the last third of the recording. Both simulate another recording from its inputs alone. Writes
-peers.json.
+peers.json and results-peers.md.
 """
 
 import argparse
 import json
+import sys
 import tempfile
 from pathlib import Path
 
@@ -19,13 +20,16 @@ from nfoursid.nfoursid import NFourSID
 from nfoursid.state_space import StateSpace
 from world import FAMILIES, pair, relative
 
-from jaxvm.identify import compensate, identify
-from jaxvm.identify.inputs import inputs_of
-from jaxvm.identify.model import CameraDrift
-from jaxvm.physics.drivers import POWER_ON
-from jaxvm.recording import read_recording
-
 HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parent))
+
+from results import markdown  # noqa: E402
+
+from jaxvm.identify import compensate, identify  # noqa: E402
+from jaxvm.identify.inputs import inputs_of  # noqa: E402
+from jaxvm.identify.model import CameraDrift  # noqa: E402
+from jaxvm.physics.drivers import POWER_ON  # noqa: E402
+from jaxvm.recording import read_recording  # noqa: E402
 
 
 def drive(inputs, names, reference) -> np.ndarray:
@@ -109,6 +113,19 @@ def _with_courses(recording, drift: CameraDrift, ports: np.ndarray) -> np.ndarra
     return -moved(camera, drift, obs.pixel, depth, ports[obs.epoch])
 
 
+def table(rows: list[dict]) -> str:
+    """results-peers.md."""
+    lines = []
+    for family in dict.fromkeys(row["family"] for row in rows):
+        own = [row for row in rows if row["family"] == family]
+        # A model that runs away removes nothing.
+        theirs = [-np.inf if r["removed_n4sid"] is None else r["removed_n4sid"] for r in own]
+        medians = np.median([r["removed"] for r in own]), np.median(theirs)
+        lines.append([family, len(own), *(f"{100.0 * share:.1f} %" for share in medians)])
+    head = ["family", "worlds", "drift removed, median", "by N4SID"]
+    return "Both from the same trajectories.\n\n" + markdown(head, lines)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description="compare with subspace identification")
     parser.add_argument("--count", type=int, default=8)
@@ -119,11 +136,9 @@ def main() -> None:
         for seed in range(options.first, options.first + options.count):
             rows.append(one(family, seed))
             print(rows[-1], flush=True)
-        own = [row for row in rows if row["family"] == family]
-        theirs = [-np.inf if r["removed_n4sid"] is None else r["removed_n4sid"] for r in own]
-        print(f"{family}: median removed {np.median([r['removed'] for r in own]):.3f}, "
-              f"N4SID {np.median(theirs):.3f}")  # fmt: skip
     (HERE / "peers.json").write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    (HERE / "results-peers.md").write_text(table(rows), encoding="utf-8")
+    print(table(rows))
 
 
 if __name__ == "__main__":

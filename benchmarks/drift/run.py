@@ -5,7 +5,8 @@
 For every random world of `world.py`, of three families, a model is identified from one recording
 and applied to a recording of another day, rate and range. Measured against the truth of the world,
 which nothing here shares code with: the drift of the marks (px RMS) and the pose that OpenCV finds
-from noise-free marks, before and after. Writes results.json and figures beside this file.
+from noise-free marks, before and after. Writes results.json, results.md and a figure beside this
+file.
 """
 
 import argparse
@@ -187,6 +188,7 @@ def main() -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     (options.out / "results.json").write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
     figure(rows, options.out / "removed.png")
+    (options.out / "results.md").write_text(table(rows) + "\n", encoding="utf-8")
     print(table(rows))
 
 

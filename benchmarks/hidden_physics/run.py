@@ -6,7 +6,6 @@ place; with which size, in standard deviations; and the held-out improvement. Th
 those of the tests. `python benchmarks/hidden_physics/run.py [SEEDS] [EMPTY]`.
 """
 
-import json
 import sys
 import tempfile
 import time
@@ -15,11 +14,14 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxvm.discover import diagnose
-from jaxvm.recording import read_recording
-from jaxvm.simulate import HIDEABLE, simulate_deformation_scene
-
 HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parent))
+
+from results import markdown, write  # noqa: E402
+
+from jaxvm.discover import diagnose  # noqa: E402
+from jaxvm.recording import read_recording  # noqa: E402
+from jaxvm.simulate import HIDEABLE, simulate_deformation_scene  # noqa: E402
 
 CATALOGUE = {
     "plate-expansion": "target-expansion",
@@ -75,6 +77,29 @@ def one(hide, seed: int) -> dict:
     return row
 
 
+def table(results: dict) -> str:
+    """results.md."""
+    hidden = [row for row in results["rows"] if row["hidden"] != "nothing"]
+    rows = [
+        [
+            row["hidden"],
+            row["seed"],
+            f"{row['rms_px']:.3f}",
+            row.get("named", "nothing"),
+            "yes" if row.get("first") else "no",
+            f"{row['heldout_px'][0]:.4f}",
+            f"{row['heldout_px'][1]:.4f}",
+        ]
+        for row in hidden
+    ]
+    head = ["hidden", "seed", "size (px RMS)", "named", "rightly", "held-out before", "after (px)"]
+    return (
+        f"Of {results['hidden']} hidden effects {results['found']} were found, "
+        f"{results['named_first']} named first; of {results['empty']} scenes with nothing hidden "
+        f"{results['false_claims']} had a claim.\n\n{markdown(head, rows)}"
+    )
+
+
 def main() -> None:
     n_seeds = int(sys.argv[1]) if len(sys.argv) > 1 else 3
     n_empty = int(sys.argv[2]) if len(sys.argv) > 2 else 20
@@ -98,7 +123,6 @@ def main() -> None:
         "not_consistent": sum(row["verdict"] != "consistent" for row in empty),
         "rows": rows,
     }
-    (HERE / "results.json").write_text(json.dumps(results, indent=1) + "\n")
     figure = Figure(figsize=(9, 4), layout="constrained")
     left, right = figure.subplots(1, 2)
     for row in hidden:
@@ -109,8 +133,7 @@ def main() -> None:
     right.plot(np.sort([row["p_left"] for row in empty]), np.linspace(0, 1, len(empty)), "o-")
     right.plot([0, 1], [0, 1], color="#334155", ls=":")
     right.set(xlabel="family-wise p where nothing is hidden", ylabel="share of scenes below")
-    figure.savefig(HERE / "results.png", dpi=120)
-    print(json.dumps({k: v for k, v in results.items() if k != "rows"}, indent=1))
+    write(HERE, results, table(results), figure)
 
 
 if __name__ == "__main__":

@@ -6,9 +6,10 @@ stereoCalibrate (five distortion coefficients a camera) fitted to the same pairs
 the pose of the board is fitted in a held-out pair.
 
     python benchmarks/opencv_stereo/run.py
+
+results.json and results.md are written here.
 """
 
-import json
 import sys
 import tempfile
 from pathlib import Path
@@ -19,11 +20,15 @@ import pandas as pd
 import tomli_w
 from scipy.optimize import least_squares
 
-from jaxvm.discover import diagnose
-from jaxvm.recording import find_data, read_recording
-from jaxvm.report import summary, write_report
-
 HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parent))
+
+from results import markdown, write_numbers  # noqa: E402
+
+from jaxvm.discover import diagnose  # noqa: E402
+from jaxvm.recording import find_data, read_recording  # noqa: E402
+from jaxvm.report import summary, write_report  # noqa: E402
+
 ROWS, COLUMNS, SPACING_M = 6, 9, 0.025
 EVERY = 3
 SIZE = (640, 480)
@@ -118,6 +123,34 @@ def opencv_heldout(pairs) -> tuple[float, float]:
     return float(rms) / np.sqrt(2.0), float(np.sqrt(np.mean(square)))
 
 
+def table(results: dict) -> str:
+    """results.md."""
+    rows = [
+        ["two pinholes, as given", 0, "", f"{results['plain_heldout_px']:.3f}"],
+        [
+            "with what was found",
+            results["coefficients_added"],
+            "",
+            f"{results['model_heldout_px']:.3f}",
+        ],
+        [
+            "and what neighbouring marks of an image foretell of each other",
+            results["coefficients_added"],
+            f"{results['fitted_px']:.3f}",
+            f"{results['heldout_px']:.3f}",
+        ],
+        [
+            f"cv2.stereoCalibrate ({results['opencv']})",
+            results["opencv_coefficients"],
+            f"{results['opencv_fitted_px']:.3f}",
+            f"{results['opencv_heldout_px']:.3f}",
+        ],
+    ]
+    head = ["model", "coefficients of the lenses and more", "fitted (px)", "held-out (px)"]
+    found = "; ".join(results["findings"])
+    return f"{results['pairs']} pairs. Found: {found}.\n\n{markdown(head, rows)}"
+
+
 def main() -> None:
     data = find_data("opencv-stereo")
     if data is None:
@@ -133,6 +166,7 @@ def main() -> None:
     results = {
         "pairs": len(pairs),
         "plain_heldout_px": found.plain.heldout_rms_px,
+        "model_heldout_px": found.heldout_after.rms_px,
         "heldout_px": found.final.heldout_rms_px,
         "fitted_px": found.final.rms_px,
         "findings": [f.effect.name for f in found.findings],
@@ -142,8 +176,7 @@ def main() -> None:
         "opencv_coefficients": 10,
         "opencv": cv2.__version__,
     }
-    (HERE / "results.json").write_text(json.dumps(results, indent=1) + "\n")
-    print(json.dumps(results, indent=1))
+    write_numbers(HERE, results, table(results))
 
 
 if __name__ == "__main__":
