@@ -124,8 +124,8 @@ def _differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[str]
     """What makes a study another one, in words."""
     theirs, ours = _parts(there), _parts(here)
     differ = [name for name in {**ours, **theirs} if theirs.get(name) != ours.get(name)]
-    # Numbers are a fingerprint, which differs with whatever else does.
-    told = [name for name in differ if name != "numbers"] or differ
+    # A model, and the fingerprint of numbers, differ with what they were made from.
+    told = [name for name in differ if name not in ("model", "numbers")] or differ[:1]
     values = {name: (str(theirs.get(name)), str(ours.get(name))) for name in told}
     return [
         f"another {name}"
