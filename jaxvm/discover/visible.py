@@ -68,7 +68,7 @@ def absorbed(ranking: Ranking, scene: Scene) -> tuple[str, ...]:
     for scores, places, _, shown in _kinds(ranking) if lost else ():
         for g, group in enumerate(scores.family.groups):
             if lost & {entry.id for entry in entries_of(group.terms, group.entity)}:
-                for s in np.flatnonzero(shown[g]):
+                for s in np.flatnonzero(shown[g]).tolist():
                     lost -= _names(scores, g, places, s, scene)
     return tuple(sorted(lost))
 
@@ -77,8 +77,8 @@ def _kinds(ranking: Ranking) -> Iterator[tuple[Scores, list[int], np.ndarray, np
     """Courses that differ in their constants alone; which [groups, scopes] were asked, and show."""
     for scores in ranking.scores:
         for places in scores.family.by_driver_and_form().values():
-            asked = scores.family.valid[:, places].any(axis=1)
-            yield scores, places, asked, scores.valid[:, places].any(axis=1)
+            asked = np.asarray(scores.family.valid[:, places].any(axis=1))
+            yield scores, places, asked, np.asarray(scores.valid[:, places].any(axis=1))
 
 
 def _names(scores: Scores, g: int, places: list[int], s: int, scene: Scene) -> set[str]:

@@ -4,8 +4,8 @@
 //
 // SOLVER is dense_schur, sparse_schur or iterative_schur. Nothing is held, no loss; the points are
 // eliminated first; steps end where the cost changes by less than 1e-7 of itself. Prints JSON: the
-// version of Ceres and, for each iteration, the least cost so far (half the sum of squares) and the
-// seconds since Solve was called, as Ceres itself reports them.
+// version of Ceres, the peak memory and, for each iteration, the least cost so far (half the sum of
+// squares) and the seconds since Solve was called, as Ceres itself reports them.
 #include <ceres/ceres.h>
 #include <ceres/rotation.h>
 
@@ -41,6 +41,19 @@ struct Row {
   int camera, point;
   double u, v;
 };
+
+// Peak memory of this process; -1 where the system does not tell.
+long peak_kb() {
+  std::ifstream status("/proc/self/status");
+  for (std::string word; status >> word;) {
+    if (word == "VmHWM:") {
+      long kb = -1;
+      status >> kb;
+      return kb;
+    }
+  }
+  return -1;
+}
 
 }  // namespace
 
@@ -98,8 +111,8 @@ int main(int argc, char** argv) {
   ceres::Solver::Summary summary;
   ceres::Solve(options, &problem, &summary);
 
-  std::printf("{\"ceres\": \"%s\", \"threads\": %d, \"run\": [", CERES_VERSION_STRING,
-              summary.num_threads_used);
+  std::printf("{\"ceres\": \"%s\", \"threads\": %d, \"peak_kb\": %ld, \"run\": [",
+              CERES_VERSION_STRING, summary.num_threads_used, peak_kb());
   double least = summary.initial_cost;
   for (const auto& step : summary.iterations) {
     // The cost of a step that is refused is that of the place where it remains.
