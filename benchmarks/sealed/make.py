@@ -14,8 +14,11 @@ import json
 import os
 from pathlib import Path
 
-# Sums by several threads differ in their last bits, and with them the hash of the key.
+# Sums by several threads, or eight at a time, differ in their last bits, and with them the hash of
+# the key: the same set has the same hash on processors with and without AVX-512.
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
+os.environ["OPENBLAS_CORETYPE"] = "Haswell"
+os.environ["NPY_DISABLE_CPU_FEATURES"] = "X86_V4 AVX512_ICL AVX512_SPR"
 
 import numpy as np
 from world import EFFECTS, KINDS, record
