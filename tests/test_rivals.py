@@ -168,6 +168,10 @@ def test_plausibility_is_no_matter_of_the_noise(warmed):
         _, others = rivals(*asked, shown, noise)
         (found_odds,) = [r.log_odds for r in others if r.hypothesis.scope.camera == ("rare",)]
         assert found_odds == pytest.approx(-np.log(2.0), abs=1e-9)
+    # What is ahead and was not chosen failed on the held-out epochs, and is no likelier for it.
+    _, others = rivals(*asked, [(rare, amplitudes, -30.0)])
+    (ahead,) = [r.log_odds for r in others if r.hypothesis.scope.camera == ("rare",)]
+    assert ahead == pytest.approx(-np.log(2.0), abs=1e-9)
 
 
 def test_what_is_remembered_is_not_counted_twice(warmed):

@@ -159,9 +159,10 @@ def rivals(
     for hypothesis, amplitudes, in_white in shown:
         # What is plausible beforehand is no matter of the noise, nor of how exact forms are.
         prior = log_prior(hypothesis, np.asarray(amplitudes)) - own_prior
-        behind = (in_white + 2.0 * prior) / noise
+        # What is ahead and was not chosen did not improve the held-out epochs: no odds for it.
+        behind = max((in_white + 2.0 * prior) / noise, 0.0)
         if behind <= limit and not hypothesis.same(own):
-            weigh(hypothesis, amplitudes, max(behind, 0.0), -0.5 * shrunk * behind)
+            weigh(hypothesis, amplitudes, behind, -0.5 * shrunk * behind)
     for rival in remembered:
         if not rival.hypothesis.same(own):
             count(rival.hypothesis, rival.names, rival.gap, rival.log_odds)
