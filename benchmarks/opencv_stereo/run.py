@@ -166,7 +166,10 @@ def main() -> None:
     results = {
         "pairs": len(pairs),
         "plain_heldout_px": found.plain.heldout_rms_px,
-        "model_heldout_px": found.heldout_after.rms_px,
+        # Without what neighbouring marks foretell of each other.
+        "model_heldout_px": found.signal.gain.before_px
+        if found.signal
+        else found.final.heldout_rms_px,
         "heldout_px": found.final.heldout_rms_px,
         "fitted_px": found.final.rms_px,
         "findings": [f.effect.name for f in found.findings],

@@ -8,12 +8,11 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Float, Int
 
 from jaxvm.montecarlo.statistics import Statistics
-from jaxvm.montecarlo.store import Store, columns_of, trial_of
+from jaxvm.montecarlo.store import Store, columns_of, table_of, trial_of
 from jaxvm.montecarlo.trials import Trial
 from jaxvm.recording.files import json_text
 
@@ -138,8 +137,7 @@ class Results:
         """
         path = Path(path)
         if path.suffix == ".parquet":
-            table = pa.table(self.columns)
-            pq.write_table(table.replace_schema_metadata({"study": json_text(self.about)}), path)
+            pq.write_table(table_of(self.columns, self.about), path)
         elif path.suffix == ".nc":
             self.to_xarray().to_netcdf(path, engine="h5netcdf")
         else:

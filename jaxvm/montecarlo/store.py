@@ -38,6 +38,11 @@ def columns_of(numbers: Int[np.ndarray, " t"], found: Trial) -> dict[str, np.nda
     return columns | {name: np.asarray(value) for name, value in found.noted.items()}
 
 
+def table_of(columns: Mapping[str, np.ndarray], about: Mapping[str, Any]) -> pa.Table:
+    """Columns as a table whose metadata tell the study, as JSON under "study"."""
+    return pa.table(dict(columns)).replace_schema_metadata({"study": json_text(about)})
+
+
 def trial_of(columns: Mapping[str, np.ndarray]) -> tuple[Int[np.ndarray, " t"], Trial]:
     """The inverse of `columns_of`."""
     groups: dict[str, dict[str, list[np.ndarray]]] = {"error": {}, "sigma": {}}
@@ -87,8 +92,7 @@ class Store:
 
     def write(self, numbers: Int[np.ndarray, " t"], found: Trial) -> None:
         """Add a part; it is on the disk when this returns."""
-        columns = columns_of(numbers, found)
-        table = pa.table(columns).replace_schema_metadata({"study": json.dumps(self.manifest)})
+        table = table_of(columns_of(numbers, found), self.manifest)
         with one_sentence(self.folder):
             handle, staging = tempfile.mkstemp(prefix=".writing-", dir=self.folder)
             try:

@@ -23,9 +23,6 @@ from jaxvm.physics.ports import PORTS
 _HOPELESS = 0.05
 """Chance to decide below which a further recording is no advice."""
 
-_NAMED = 4
-"""Effects that a recording can't show and that are named in the terminal."""
-
 _PORT = {port.name: port for port in PORTS}
 
 HAZE, STABILISER = BY_ID["haze"], BY_ID["image-jumps"]
@@ -364,14 +361,6 @@ def _count(n: int) -> str:
     )
 
 
-def _counted(absorbed: tuple[str, ...]) -> str:
-    """What the model's unknowns absorb, a few by name."""
-    named = ", ".join(absorbed[:_NAMED])
-    more = len(absorbed) - _NAMED
-    rest = f" and {more} more effects" if more > 0 else ""
-    return f"{named}{rest}: the model's own unknowns absorb them, or too few epochs carry them"
-
-
 def summary(diagnosis: Diagnosis) -> str:
     """The diagnosis for a terminal."""
     plain, final = diagnosis.plain, diagnosis.final
@@ -417,5 +406,9 @@ def summary(diagnosis: Diagnosis) -> str:
     if located and diagnosis.significant_left:
         lines += ["", "left over  " + "; ".join(place.words() for place in located[:3])]
     if diagnosis.absorbed:
-        lines += ["", f"can't show {_counted(diagnosis.absorbed)}"]
+        lines += [
+            "",
+            f"can't show {len(diagnosis.absorbed)} of the effects that were asked (the report has "
+            "them): the model's own unknowns absorb them, or too few epochs carry them",
+        ]
     return "\n".join(lines)
