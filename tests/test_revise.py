@@ -39,6 +39,7 @@ class Told:
     others: tuple = ()
     rivals: tuple[Rival, ...] = ()
     alternatives: tuple[Hypothesis, ...] = ()
+    noise: float = 1.0
 
 
 def told(effect):
@@ -188,12 +189,28 @@ def test_other_names_are_tried_for_what_has_one(drifting):
 def test_a_name_leads_as_soon_as_it_is_as_likely(drifting, weight, leads):
     naming, fit, unnamed = drifting
     named = naming.with_names_to_try(fit, [unnamed], 0).alternatives[0]
-    findings = [replace(unnamed, rivals=(Rival(named, 0.0, weight),))]
+    # As far behind as it is, or more.
+    findings = [replace(unnamed, rivals=(Rival(named, 1e6, weight),))]
     _, found = likelier(fit, findings, 0, naming.parts.fit)
     assert bool(found[0].hypothesis.entries) == leads
     # Of two names one must be clearly likelier.
     among = [replace(findings[0], hypothesis=named)]
     assert likelier(fit, among, 0, naming.parts.fit)[1] is among
+
+
+def test_a_double_whose_refit_is_far_behind_does_not_lead(drifting):
+    """What was expected of it is no matter once it is refitted: the recording has spoken."""
+    naming, fit, unnamed = drifting
+    named = naming.with_names_to_try(fit, [unnamed], 0).alternatives[0]
+    aside = replace(named, group=Group((Term("sensor.cx"),), "camera"))
+    drop = 2.0 * (naming.tests.fit.cost - fit.cost)
+    finding = replace(unnamed, drop=drop, weight=0.3, rivals=(Rival(aside, 0.0, 0.7),))
+    fitted, (found,) = likelier(fit, [finding], 0, naming.parts.fit)
+    (rival,) = found.rivals
+    assert fitted is fit and not found.hypothesis.entries
+    assert rival.gap > 0.8 * drop > 15.0
+    assert rival.weight < 0.7 * np.exp(-0.3 * drop + 3.0)
+    assert found.weight + rival.weight == pytest.approx(1.0)
 
 
 def test_amounts_of_all_marks_lead_when_they_are_likelier(known):

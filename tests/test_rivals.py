@@ -11,9 +11,9 @@ from jaxvm.discover.diagnose import ROOM, _plain_fit
 from jaxvm.discover.groups import Group
 from jaxvm.discover.hypotheses import Family, Hypothesis
 from jaxvm.discover.ranking import top
-from jaxvm.discover.rivals import rivals
+from jaxvm.discover.rivals import Rival, as_shown, rivals
 from jaxvm.discover.score import ScoreTests
-from jaxvm.discover.select import decisive_gap, refit, stacked
+from jaxvm.discover.select import decisive_gap, refit, stacked, toll
 from jaxvm.discover.space import enumerate_hypotheses
 from jaxvm.network.scene import build
 from jaxvm.network.start import start
@@ -214,3 +214,19 @@ def test_a_peak_lies_between_points_of_a_grid_and_in_none_of_its_gaps():
     # ... and not through the night between two sessions, where it would rise to thousands.
     drops = [2.0, 65.0, 64.0]
     np.testing.assert_array_equal(_raised([1600.0, 86_500.0, 86_630.0], drops), drops)
+
+
+def test_a_refit_speaks_of_one_driver_and_form_alone(warmed):
+    """Beyond the decisive gap every unit counts; the other forms of the name keep their odds."""
+    own = fitted(warmed, 0.0)[-1].hypothesis
+    other = replace(own, course=Course("time", "linear"))
+    drop = 1e4
+    limit = decisive_gap(drop)
+    assert toll(limit + 7.0, drop) == pytest.approx(toll(limit, drop) + 7.0)
+    rival = Rival(own, 1.0, 0.6, log_odds=2.0, kinds=((2.0, 1.0, own), (1.0, 3.0, other)))
+    assert as_shown(rival, 0.5, drop).weight == pytest.approx(0.6)
+    shown = as_shown(rival, limit + 40.0, drop)
+    assert shown.hypothesis is other and shown.gap == 3.0 and shown.log_odds == 1.0
+    assert shown.weight == pytest.approx(0.6 * np.exp(1.0) / (np.exp(1.0) + np.exp(2.0)), rel=1e-3)
+    taken = shown.kinds[0][0] - shown.kinds[1][0]
+    assert taken == pytest.approx(-1.0 + 0.5 * (toll(limit + 40.0, drop) - toll(1.0, drop)))

@@ -28,8 +28,9 @@ _WIDER = 1.2
 _LEADING, _NAMES = 60, 3
 """Leading hypotheses among which names are looked for, and names tried for each finding."""
 
-_BEHIND = 10.0
-"""Foretold evidence by which another name may fall behind and still be tried: fits are curved."""
+_BEHIND, _TIE = 10.0, 0.01
+"""Foretold evidence by which another name may fall behind and still be tried, and the share of a
+large one: fits are curved."""
 
 Named = tuple[Adjustment, list[Finding]]
 """A fit and the findings that are the last of its effects."""
@@ -52,13 +53,14 @@ class Naming:
     """By the place of a finding the last fit with it, that without it, and the tests of that: where
     no name changed, rivals are weighed by what names were looked for with."""
 
-    def last(self, current: Adjustment, findings: list[Finding]) -> Named:
+    def last(self, current: Adjustment, findings: list[Finding], replaced: bool = False) -> Named:
         """The fit and its findings with their last names, weights and rivals.
 
-        A finding whose name has changed has no standard deviations (`Finding.stds`) yet.
+        A finding whose name has changed has no standard deviations (`Finding.stds`) yet. One that
+        `replaced` another was named and weighed beside that one.
         """
         named = current, findings
-        if len(findings) > 1:
+        if len(findings) > 1 or (findings and replaced):
             named = current, [self.with_names_to_try(*named, k) for k in range(len(findings))]
             named = self._renamed(*named)
             named = self._weighed(*named, [True] * len(named[1]))
@@ -87,7 +89,7 @@ class Naming:
         weigh = Weighing.at(without, ranking, self.parts.n)
         leading = shortlist(ranking, current.scene, weigh, _LEADING, FREE)
         own = finding.hypothesis
-        least = next((e for h, e, _ in leading if h.same(own)), -np.inf) - _BEHIND
+        least = next((e - max(_BEHIND, _TIE * e) for h, e, _ in leading if h.same(own)), -np.inf)
         if own.entries:
             first = {claim_of(own): own}
             for hypothesis, evidence, _ in leading:

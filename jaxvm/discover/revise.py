@@ -12,7 +12,7 @@ import numpy as np
 from jaxvm.discover.constants import sensible
 from jaxvm.discover.diagnosis import Finding
 from jaxvm.discover.hypotheses import FREE, Hypothesis
-from jaxvm.discover.rivals import Rival
+from jaxvm.discover.rivals import Rival, as_shown
 from jaxvm.discover.select import (
     price,
     price_of_columns,
@@ -44,6 +44,9 @@ _MOVING = {
 
 _HIDDEN = 0.5
 """Share of its drop of chi-square below which a finding is hidden by amounts of every image."""
+
+_REFITTED = 4
+"""Doubles that are refitted at most before the likeliest of them leads."""
 
 _LIKELIER = 2.0
 """Odds from which a double leads in place of what fits best; less is within what odds are worth."""
@@ -132,7 +135,7 @@ def rename(
     can follow fits under any name beside them, and keeps its own.
     """
     k, left = 0, _MOST_TRIED
-    while len(findings) > 1 and k < len(findings):
+    while k < len(findings):
         finding = findings[k]
         if hidden(current, findings, k):
             k += 1
@@ -186,28 +189,68 @@ def likelier(
 ) -> tuple[Adjustment, list[Finding]]:
     """Findings whose k-th has the name of a double that is clearly likelier than what fits best.
 
-    What fits best by a little may be the less plausible one by far. One that has a name leads what
-    has none as soon as it is as likely.
+    What fits best by a little may be the less plausible one by far: the refit tells whether it is a
+    little. One that has a name leads what has none as soon as it is as likely.
     """
-    finding, scene = findings[k], current.scene
-    named = [rival for rival in finding.rivals if rival.hypothesis.entries]
-    best = max(named, key=lambda rival: rival.weight, default=None)
-    odds = _LIKELIER if finding.hypothesis.entries else 1.0
-    if best is None or best.weight < odds * finding.weight:
-        return current, findings
-    effects, place = list(scene.fitted_effects()), given_effects(current, findings) + k
-    effects[place] = best.hypothesis.effect(np.zeros(best.hypothesis.n_columns))
+    refitted: list[Hypothesis] = []
+    while True:
+        finding = findings[k]
+        named = [rival for rival in finding.rivals if rival.hypothesis.entries]
+        best = max(named, key=lambda rival: rival.weight, default=None)
+        odds = _LIKELIER if finding.hypothesis.entries else 1.0
+        if best is None or best.weight < odds * finding.weight:
+            return current, findings
+        tried = _in_place(current, findings, k, best.hypothesis, fit)
+        if not tried.converged:
+            return current, findings
+        one = finding.noise * min(current.variance_factor, tried.variance_factor)
+        behind = 2.0 * (tried.cost - current.cost) / one
+        known = len(refitted) == _REFITTED or any(best.hypothesis.same(h) for h in refitted)
+        if known or behind <= best.gap:
+            return tried, with_effects(
+                [*findings[:k], _led_by(finding, best), *findings[k + 1 :]], tried
+            )
+        refitted.append(best.hypothesis)
+        shown = as_shown(best, behind, finding.drop / one)
+        findings = [*findings[:k], _with_rival(finding, best, shown), *findings[k + 1 :]]
+
+
+def _in_place(
+    current: Adjustment, findings: list[Finding], k: int, hypothesis: Hypothesis, fit: Fit
+) -> Adjustment:
+    """The fit with another hypothesis in place of the k-th finding."""
+    scene, place = current.scene, given_effects(current, findings) + k
+    effects = list(scene.fitted_effects())
+    effects[place] = hypothesis.effect(np.zeros(hypothesis.n_columns))
     scene = scene.with_effects(tuple(effects), room_for(tuple(effects), scene.room))
-    tried = fit(with_spread(scene, place, best.hypothesis, fit))
-    if not tried.converged:
-        return current, findings
+    return fit(with_spread(scene, place, hypothesis, fit))
+
+
+def _with_rival(finding: Finding, rival: Rival, other: Rival) -> Finding:
+    """A finding with another weight of one of its rivals, among which all of it is shared."""
+    total = 1.0 - rival.weight + other.weight
+    rivals = [other if r is rival else r for r in finding.rivals]
+    rivals = [replace(r, weight=r.weight / total) for r in rivals]
+    return replace(
+        finding,
+        weight=finding.weight / total,
+        rivals=tuple(sorted(rivals, key=lambda rival: -rival.weight)),
+    )
+
+
+def _led_by(finding: Finding, best: Rival) -> Finding:
+    """A finding that has the name of one of its rivals, and its own among them."""
     before = Rival(finding.hypothesis, 0.0, finding.weight, finding.others)
     others = [
-        replace(rival, log_odds=rival.log_odds - best.log_odds)
+        replace(
+            rival,
+            log_odds=rival.log_odds - best.log_odds,
+            kinds=tuple((odds - best.log_odds, *kind) for odds, *kind in rival.kinds),
+        )
         for rival in (*finding.rivals, before)
         if rival is not best
     ]
-    leading = replace(
+    return replace(
         finding,
         hypothesis=best.hypothesis,
         stds=(),
@@ -215,7 +258,6 @@ def likelier(
         others=best.others,
         rivals=tuple(sorted(others, key=lambda rival: -rival.weight)),
     )
-    return tried, with_effects([*findings[:k], leading, *findings[k + 1 :]], tried)
 
 
 def with_effects(findings: list[Finding], fitted: Adjustment) -> list[Finding]:

@@ -8,6 +8,7 @@ were not worth a refit, as one tangent foretells it.
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from jaxvm.discover.hypotheses import FREE, Family, Hypothesis
 from jaxvm.discover.ranking import Ranking
 from jaxvm.discover.scatter import families_of_images
 from jaxvm.discover.score import ScoreTests
-from jaxvm.discover.select import DECIDED, decisive_gap, log_prior, price_of_columns, stacked
+from jaxvm.discover.select import decisive_gap, log_prior, price_of_columns, stacked, toll
 from jaxvm.discover.space import member
 from jaxvm.physics.effects import Effect
 from jaxvm.physics.forms import FORMS
@@ -32,6 +33,10 @@ _LEAST = 0.5
 of less its tangent says nothing."""
 
 
+Kind = tuple[float, float, Hypothesis]
+"""Log odds, gap and hypothesis of one driver and form."""
+
+
 @dataclass(frozen=True)
 class Rival:
     """A hypothesis that the recording can't tell from the chosen one.
@@ -43,6 +48,7 @@ class Rival:
         log_odds: of its best driver and form, against the chosen one.
         others: the same physics after other drivers, which it may follow as well.
         names: all that its combination may be called.
+        kinds: of each driver and form the log odds, the gap and the hypothesis.
     """
 
     hypothesis: Hypothesis
@@ -51,6 +57,7 @@ class Rival:
     others: tuple[Hypothesis, ...] = ()
     names: tuple[str, ...] = ()
     log_odds: float = 0.0
+    kinds: tuple[Kind, ...] = ()
 
 
 @dataclass
@@ -65,17 +72,16 @@ class _Claim:
     names: tuple[str, ...]
     gap: float
     log_odds: float
-    of_kind: dict[tuple[str, str], tuple[float, Hypothesis]] = field(default_factory=dict)
+    of_kind: dict[tuple[str, str], Kind] = field(default_factory=dict)
 
     @property
     def weight(self) -> float:
-        return float(np.logaddexp.reduce([odds for odds, _ in self.of_kind.values()]))
+        return _summed(self.of_kind.values())
 
     def of_driver(self) -> list[tuple[float, Hypothesis]]:
         """The best form of each driver, best first."""
-        ordered = sorted(self.of_kind.values(), key=lambda known: -known[0])
         best: dict[str, tuple[float, Hypothesis]] = {}
-        for odds, hypothesis in ordered:
+        for odds, _, hypothesis in _best_first(self.of_kind.values()):
             best.setdefault(hypothesis.course.driver, (odds, hypothesis))
         return list(best.values())
 
@@ -109,9 +115,8 @@ def rivals(
     variance = noise * after.variance_factor
     change = stacked(before) - stacked(after)
     full = float(np.sum(change**2)) / variance
-    # The gap that decides, and by how much smaller ones are shrunk.
     limit = decisive_gap(full)
-    shrunk = DECIDED / limit
+    tolled = partial(toll, drop=full)
     claims: dict[tuple, _Claim] = {}
     own_amplitudes = np.asarray(effect.amplitudes)
     own_prior = log_prior(own, own_amplitudes)
@@ -132,7 +137,7 @@ def rivals(
             claim.gap, claim.log_odds = gap, odds
         kind = named.course.driver, named.course.form
         if kind not in claim.of_kind or odds > claim.of_kind[kind][0]:
-            claim.of_kind[kind] = odds, named
+            claim.of_kind[kind] = odds, gap, named
 
     scene, found = before.scene, []
     # Neither is among the hypotheses that are scored together: what every image has for itself, and
@@ -154,15 +159,14 @@ def rivals(
         columns = price_of_columns(hypothesis, amplitudes, full - gap, n) - own_columns
         if gap + min(columns, 0.0) <= limit:
             cost = columns + prices[_course_of(hypothesis)] - own_price
-            behind = shrunk * min(gap, limit) + max(gap - limit, 0.0)
-            weigh(hypothesis, amplitudes, gap, -0.5 * (behind + cost))
+            weigh(hypothesis, amplitudes, gap, -0.5 * float(tolled(gap) + cost))
     for hypothesis, amplitudes, in_white in shown:
         # What is plausible beforehand is no matter of the noise, nor of how exact forms are.
         prior = log_prior(hypothesis, np.asarray(amplitudes)) - own_prior
         # What is ahead and was not chosen did not improve the held-out epochs: no odds for it.
         behind = max((in_white + 2.0 * prior) / noise, 0.0)
         if behind <= limit and not hypothesis.same(own):
-            weigh(hypothesis, amplitudes, behind, -0.5 * shrunk * behind)
+            weigh(hypothesis, amplitudes, behind, -0.5 * float(tolled(behind)))
     for rival in remembered:
         if not rival.hypothesis.same(own):
             count(rival.hypothesis, rival.names, rival.gap, rival.log_odds)
@@ -194,7 +198,48 @@ def _rival(claim: _Claim, weight: float, driver: str = "") -> Rival:
     ordered = claim.of_driver()
     least = ordered[0][0] - np.log(_ODDS)
     near = [h for odds, h in ordered if h.course.driver != first and odds > least]
-    return Rival(claim.hypothesis, claim.gap, weight, tuple(near), claim.names, claim.log_odds)
+    return Rival(
+        claim.hypothesis,
+        claim.gap,
+        weight,
+        tuple(near),
+        claim.names,
+        claim.log_odds,
+        tuple(_best_first(claim.of_kind.values())),
+    )
+
+
+def _best_first(kinds: Iterable[Kind]) -> list[Kind]:
+    return sorted(kinds, key=lambda kind: -kind[0])
+
+
+def _summed(kinds: Iterable[Kind]) -> float:
+    return float(np.logaddexp.reduce([odds for odds, *_ in kinds]))
+
+
+def as_shown(rival: Rival, behind: float, drop: float) -> Rival:
+    """A rival whose best driver and form, refitted, is behind by more than was expected.
+
+    Args:
+        rival: with a weight that is brought down by what the refit takes from its odds.
+        behind: by how much it fits worse (chi-square).
+        drop: of chi-square that both explain.
+    """
+    (odds, gap, hypothesis), *others = rival.kinds or (
+        (rival.log_odds, rival.gap, rival.hypothesis),
+    )
+    taken = 0.5 * float(toll(max(behind, gap), drop) - toll(gap, drop))
+    kinds = _best_first([(odds - taken, max(behind, gap), hypothesis), *others])
+    log_odds, least, best = kinds[0]
+    share = np.exp(_summed(kinds) - _summed([(odds, gap, hypothesis), *others]))
+    return replace(
+        rival,
+        hypothesis=best,
+        gap=least,
+        log_odds=log_odds,
+        weight=rival.weight * float(share),
+        kinds=tuple(kinds),
+    )
 
 
 def claim_of(hypothesis: Hypothesis) -> tuple:

@@ -364,7 +364,8 @@ class Search:
             self.findings = self._confirmed()
         names = [finding.hypothesis for finding in self.findings]
         naming = Naming(self._tests, parts, self.heldout)
-        self.current, self.findings = naming.last(self.current, self.findings)
+        replaced = bool(self._superfluous)
+        self.current, self.findings = naming.last(self.current, self.findings, replaced)
         if [finding.hypothesis for finding in self.findings] != names:
             self.current, self.heldout = parts.proven(self.current)
             deviations = effect_deviations(self.current)[self.given :]

@@ -118,6 +118,15 @@ def decisive_gap(drop):
     return DECIDED + _COARSE * drop
 
 
+def toll(gap, drop):
+    """What a gap takes of the odds, in chi-square: up to the one that decides it is shrunk.
+
+    The forms are not exact enough for less. What is more counts in full.
+    """
+    limit = decisive_gap(drop)
+    return DECIDED * np.minimum(gap, limit) / limit + np.maximum(gap - limit, 0.0)
+
+
 def log_prior(hypothesis: Hypothesis, amplitudes: np.ndarray) -> float:
     """Log plausibility: named physics of a plausible size is preferred.
 
