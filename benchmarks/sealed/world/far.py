@@ -90,7 +90,8 @@ def _move(rng, turn, shift, reach, lean, count, plan):
         roll = np.linspace(0.0, 0.5 * np.pi, count)[:, None] * np.array([0.0, 0.0, 1.0])
         turns = matrix(roll) @ turns
     if plan == "tilt":
-        turns = matrix([0.0, 0.8, 0.0]) @ turns
+        side = np.where(np.arange(count) % 2, 0.7, -0.7)[:, None]
+        turns = matrix(side * np.array([0.0, 1.0, 0.0])) @ turns
     return turns, shifts
 
 
@@ -202,7 +203,7 @@ def stereo(seed, plan, size):
         path.turn_reach[2] = 0.0
         path.turn_middle[2] += 0.5 * np.pi
     if plan == "tilt":
-        path.turn_middle[1] += 0.8
+        path.lean, path.over_s = 0.7, 0.5 * (t[len(t) // 2 - 1] + t[len(t) // 2])
     if plan == "field":
         path.reach[:2] *= 1.4
     turns, shifts = path.pose(t)

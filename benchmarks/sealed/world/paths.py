@@ -9,7 +9,10 @@ from .rotation import matrix
 
 @dataclass
 class Path:
-    """Sum of sines in position (m) and in the rotation vector (rad); `pace` scales time."""
+    """Sum of sines in position (m) and in the rotation vector (rad); `pace` scales time.
+
+    It leans (rad) to one side of its y axis, and from the instant `over_s` on to the other.
+    """
 
     middle: np.ndarray
     reach: np.ndarray
@@ -20,6 +23,8 @@ class Path:
     turn_rate: np.ndarray
     turn_phase: np.ndarray
     pace: float = 1.0
+    lean: float = 0.0
+    over_s: float = 0.0
 
     def pose(self, t):
         """Axes [n, 3, 3] and position [n, 3] at times [n] (s)."""
@@ -30,6 +35,7 @@ class Path:
         turn = self.turn_middle + np.sum(
             self.turn_reach * np.sin(self.turn_rate * t[..., None] + self.turn_phase), axis=-1
         )
+        turn[:, 1] += self.lean * np.where(t[:, 0] < self.over_s, -1.0, 1.0)
         return matrix(turn), shift
 
     def velocity(self, t):
