@@ -5,7 +5,8 @@ need it. The settings below are made unless the environment already has them:
 
 - XLA runs and waits in one pool of as many threads as there are cores (NPROC); with two cores, two
   batched triangular solves that wait for each other's helpers lock up for ever. Eight are enough.
-- OpenBLAS must not start threads for matrices of 30 rows: it made them 200 times slower.
+- OpenBLAS must not start threads for matrices of 30 rows: it made them 200 times slower. Also
+  where NumPy was imported before.
 - XLA's own threads inside one operation bring nothing for the many small blocks here.
 - XLA's fusion emitters double the time of compiling and save a sixth of the time of running; a
   diagnosis of a recording of a new size is mostly compiling. From jaxlib 0.11.1 on there is no
@@ -47,7 +48,12 @@ if _jaxlib < (0, 12) and _on_processors:
 for _flag, _value in _flags.items():
     if _flag not in os.environ.get("XLA_FLAGS", ""):
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_flag}={_value}".strip()
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+if "OPENBLAS_NUM_THREADS" not in os.environ:
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"
+    if "numpy" in sys.modules:  # it has read the environment already
+        from threadpoolctl import ThreadpoolController
+
+        ThreadpoolController().select(internal_api="openblas").limit(limits=1)
 os.environ.setdefault("NPROC", str(max(8, os.cpu_count() or 1)))
 
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -2, -3, -8  # of <malloc.h>

@@ -38,6 +38,32 @@ def test_barriers_stay_on_processors_alone(tmp_path, plugin):
     assert ("cse_barrier_expander" in flags(**path, JAX_PLATFORMS="cpu")) == KEPT
 
 
+@pytest.mark.parametrize("first", ["jaxvm", "numpy, scipy.linalg"])
+def test_openblas_has_one_thread_whatever_is_imported_first(first):
+    """They wait in loops and take the cores from XLA: adjustment took three times as long."""
+    assert openblas_threads(first) == {1}
+
+
+@pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="OpenBLAS has one thread on one core")
+def test_the_users_number_of_threads_stays():
+    assert openblas_threads("numpy, scipy.linalg", OPENBLAS_NUM_THREADS="2") == {2}
+
+
+def openblas_threads(first: str, **env) -> set[int]:
+    """Numbers of threads of all that OpenBLAS is loaded in, after the imports."""
+    code = (
+        f"import {first}\n"
+        "import jaxvm, scipy.linalg, threadpoolctl\n"
+        "libraries = threadpoolctl.threadpool_info()\n"
+        "print(*(one['num_threads'] for one in libraries if one['internal_api'] == 'openblas'))"
+    )
+    known = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
+    said = subprocess.run(
+        [sys.executable, "-c", code], env=known | env, check=True, capture_output=True, text=True
+    )
+    return set(map(int, said.stdout.split()))
+
+
 def test_what_the_user_sets_stays():
     own = "--xla_cpu_multi_thread_eigen=true --xla_disable_hlo_passes=none"
     found = flags(XLA_FLAGS=own)
