@@ -213,6 +213,23 @@ def test_a_double_whose_refit_is_far_behind_does_not_lead(drifting):
     assert found.weight + rival.weight == pytest.approx(1.0)
 
 
+def test_what_took_the_place_of_another_is_named_anew(drifting):
+    """Beside what it replaced it was compared with what adds to that one."""
+    naming, drift, unnamed = drifting
+    names = naming.with_names_to_try(drift, [unnamed], 0).alternatives
+    jump = next(h for h in names if h.course.form == "step")
+    scene = drift.scene.with_effects((jump.effect((0.0,)),), drift.scene.room)
+    fit = naming.parts.fit(scene)
+    (effect,) = fit.scene.fitted_effects()
+    drop = 2.0 * (naming.tests.fit.cost - fit.cost)
+    found = replace(unnamed, hypothesis=jump, effect=effect, drop=drop)
+    _, (kept,) = naming.last(fit, [found])
+    assert kept.hypothesis is jump and not kept.rivals
+    _, (anew,) = naming.last(fit, [found], replaced=True)
+    assert anew.alternatives and anew.rivals
+    assert anew.weight + sum(rival.weight for rival in anew.rivals) == pytest.approx(1.0, abs=0.1)
+
+
 def test_amounts_of_all_marks_lead_when_they_are_likelier(known):
     """Their spread belongs to them: without it they would fit what they can't know."""
     depths = 2e-4 * np.random.default_rng(3).standard_normal(len(MARKS))
