@@ -168,6 +168,11 @@ def test_plausibility_is_no_matter_of_the_noise(warmed):
         _, others = rivals(*asked, shown, noise)
         (found_odds,) = [r.log_odds for r in others if r.hypothesis.scope.camera == ("rare",)]
         assert found_odds == pytest.approx(-np.log(2.0), abs=1e-9)
+    # What fits as well with a column less saves it in full, however large the effect.
+    narrow, saved = replace(rare, course=Course(own.course.driver, "linear")), np.log(parts.n)
+    _, others = rivals(*asked, [(narrow, amplitudes[:1], 2.0 * np.log(2.0) - saved)])
+    (narrower,) = [r.log_odds for r in others if r.hypothesis.scope.camera == ("rare",)]
+    assert narrower == pytest.approx(0.5 * saved - np.log(2.0), abs=1e-9)
     # What is ahead and was not chosen failed on the held-out epochs, and is no likelier for it.
     _, others = rivals(*asked, [(rare, amplitudes, -30.0)])
     (ahead,) = [r.log_odds for r in others if r.hypothesis.scope.camera == ("rare",)]

@@ -17,7 +17,14 @@ from jaxvm.discover.hypotheses import FREE, Family, Hypothesis
 from jaxvm.discover.ranking import Ranking
 from jaxvm.discover.scatter import families_of_images
 from jaxvm.discover.score import ScoreTests
-from jaxvm.discover.select import decisive_gap, log_prior, price_of_columns, stacked, toll
+from jaxvm.discover.select import (
+    decisive_gap,
+    log_prior,
+    price_of_columns,
+    price_of_constants,
+    stacked,
+    toll,
+)
 from jaxvm.discover.space import member
 from jaxvm.physics.effects import Effect
 from jaxvm.physics.forms import FORMS
@@ -160,13 +167,17 @@ def rivals(
         if gap + min(columns, 0.0) <= limit:
             cost = columns + prices[_course_of(hypothesis)] - own_price
             weigh(hypothesis, amplitudes, gap, -0.5 * float(tolled(gap) + cost))
+    own_price = own_columns + price_of_constants(own, full, n)
     for hypothesis, amplitudes, in_white in shown:
-        # What is plausible beforehand is no matter of the noise, nor of how exact forms are.
+        # What is plausible beforehand, and what columns and constants cost, is no matter of the
+        # noise, nor of how exact forms are.
         prior = log_prior(hypothesis, np.asarray(amplitudes)) - own_prior
-        # What is ahead and was not chosen did not improve the held-out epochs: no odds for it.
-        behind = max((in_white + 2.0 * prior) / noise, 0.0)
+        cost = price_of_columns(hypothesis, amplitudes, full, n) - own_price
+        cost += price_of_constants(hypothesis, full, n)
+        # What fits better and was not chosen did not improve the held-out epochs: no odds for it.
+        behind = max((in_white + 2.0 * prior - cost) / noise, 0.0)
         if behind <= limit and not hypothesis.same(own):
-            weigh(hypothesis, amplitudes, behind, -0.5 * float(tolled(behind)))
+            weigh(hypothesis, amplitudes, behind, -0.5 * float(tolled(behind) + cost))
     for rival in remembered:
         if not rival.hypothesis.same(own):
             count(rival.hypothesis, rival.names, rival.gap, rival.log_odds)
