@@ -167,12 +167,12 @@ def rivals(
         if gap + min(columns, 0.0) <= limit:
             cost = columns + prices[_course_of(hypothesis)] - own_price
             weigh(hypothesis, amplitudes, gap, -0.5 * float(tolled(gap) + cost))
-    own_price = own_columns + price_of_constants(own, full, n)
+    own_cost = own_columns + price_of_constants(own, full, n)
     for hypothesis, amplitudes, in_white in shown:
         # What is plausible beforehand, and what columns and constants cost, is no matter of the
         # noise, nor of how exact forms are.
         prior = log_prior(hypothesis, np.asarray(amplitudes)) - own_prior
-        cost = price_of_columns(hypothesis, amplitudes, full, n) - own_price
+        cost = price_of_columns(hypothesis, amplitudes, full, n) - own_cost
         cost += price_of_constants(hypothesis, full, n)
         # What fits better and was not chosen did not improve the held-out epochs: no odds for it.
         behind = max((in_white + 2.0 * prior - cost) / noise, 0.0)
