@@ -54,7 +54,7 @@ def at_values(scene: Scene, values: dict[str, np.ndarray]) -> Scene:
     """The scene with some fields of its state replaced."""
     state = {name: getattr(scene.state, name) for name in State.__dataclass_fields__}
     for name, value in values.items():
-        if name == "point":
+        if name in ("point", "world_from_station", "carrier_from_target"):
             # The table has spare rows.
             value = np.concatenate([value, np.asarray(state[name])[len(value) :]])
         assert state[name].shape == np.shape(value), name

@@ -65,6 +65,7 @@ def at_poses_of_file(file, **options):
     """The scene that the file describes, poses too."""
     scene = build(import_libmv(file, **options))
     poses = jnp.asarray(libmv_poses(file))
+    poses = scene.state.world_from_station.at[: len(poses)].set(poses)
     return scene.with_state(eqx.tree_at(lambda s: s.world_from_station, scene.state, poses))
 
 

@@ -136,7 +136,7 @@ def test_unseen_bodies_with_a_known_pose_need_no_view():
     )
     begun = start(build(replace(blind, model=model)))
     assert np.allclose(begun.state.world_from_station[1], 0.1)
-    assert np.allclose(begun.state.carrier_from_target[-1], 0.2)
+    assert np.allclose(begun.state.carrier_from_target[begun.target_row[-1, 0]], 0.2)
 
 
 def thinned(obs, keep):

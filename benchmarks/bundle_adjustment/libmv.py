@@ -36,6 +36,7 @@ def at_poses_of_file(file: Path) -> Scene:
     """The scene of a file, its poses too."""
     scene = build(import_libmv(file))
     poses = jnp.asarray(libmv_poses(file))
+    poses = scene.state.world_from_station.at[: len(poses)].set(poses)
     return scene.with_state(eqx.tree_at(lambda s: s.world_from_station, scene.state, poses))
 
 

@@ -289,7 +289,7 @@ def _hysteresis(driver: str, width: float, reference: float) -> list[Course]:
 
 
 def _recorded(driver: str, channels: Channels) -> np.ndarray:
-    return np.asarray(channels.values[channels.index(driver)])
+    return np.asarray(channels.values)[channels.index(driver)]
 
 
 def _reference(driver: str, channels: Channels) -> float:
@@ -308,7 +308,7 @@ def _reference(driver: str, channels: Channels) -> float:
 def longest_session(channels: Channels) -> float:
     """Length of the longest session (s): no lag or period is known from the pause between two."""
     if SESSION not in channels.names:
-        return float(channels.epoch_time[-1] - channels.epoch_time[0])
+        return float(np.ptp(channels.epoch_time))
     since = np.interp(channels.epoch_time, channels.time, _recorded(SESSION, channels))
     return float(np.max(since))
 

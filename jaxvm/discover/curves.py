@@ -58,7 +58,7 @@ def curved_drivers(scene: Scene, form: str = "curve") -> list[tuple[str, tuple[f
         return []
     found = []
     for name, kind in zip(channels.names, channels.kinds, strict=True):
-        values = np.interp(time, channels.time, channels.values[channels.index(name)])
+        values = np.interp(time, channels.time, np.asarray(channels.values)[channels.index(name)])
         followed = ("time", "quantity") if form == "curve" else ("time",)
         if kind in followed and np.ptp(values) > 0.0:
             constants = curve_constants(float(values.min()), float(values.max()), form)

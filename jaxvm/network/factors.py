@@ -104,8 +104,9 @@ class PixelFactor(Factor):
 
 
 class RangeFactor(Factor):
-    """Distances of all rangefinders: predicted minus measured (m)."""
+    """Distances of all rangefinders: predicted minus measured (m); padded like image points."""
 
+    real: Int[Array, ""]
     slots: Int[Array, "observations slots"]
     sigma: Float[Array, "observations 1"]
     weight: Float[Array, " observations"]
@@ -114,6 +115,10 @@ class RangeFactor(Factor):
     measured: Float[Array, " observations"]
     view: Int[Array, " observations"]
     pattern: Float[Array, "observations columns"]
+
+    @property
+    def n_real(self) -> int:
+        return int(self.real)
 
     def bare(self):
         return eqx.tree_at(lambda f: f.pattern, self, self.pattern[:, :0])

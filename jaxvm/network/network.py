@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxvm.network.factors import (
@@ -65,6 +66,13 @@ class Network(eqx.Module):
         others = (self.ranges, self.links, self.edges, self.closures, self.priors)
         rest = (None if factor is None else next(left) for factor in others)
         return Residuals(tuple(blocks[:n]), *rest)
+
+    def unpadded(self, residuals: "Residuals") -> "Residuals":
+        """Blocks of all tables without the padding at their ends, as NumPy's."""
+        blocks = (*residuals.pixels, *(block for block in residuals[1:] if block is not None))
+        tables = zip(blocks, self.factors(), strict=True)
+        # Cut on the host: to cut on a device is a program for every number of observations.
+        return self.residuals([np.asarray(block)[: factor.n_real] for block, factor in tables])
 
 
 class Residuals(NamedTuple):

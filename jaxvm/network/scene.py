@@ -19,6 +19,7 @@ from jaxvm.network.network import Network
 from jaxvm.network.state import N_DISTORTION, Layout, State
 from jaxvm.network.tables import Tables
 from jaxvm.network.unknowns import Unknowns, free_unknowns
+from jaxvm.physics.blocks import rounded
 from jaxvm.physics.effects import Effect, capacity, tabulate
 from jaxvm.recording import Recording
 
@@ -203,7 +204,9 @@ def _given_state(recording, station_row, target_row) -> State:
     model = recording.model
 
     def poses(bodies, row):
-        table = np.zeros((int(row.max()) + 1 if row.size else 0, 6))
+        n = int(row.max()) + 1 if row.size else 0
+        # Spare rows, so that some epochs more or less are no other program.
+        table = np.zeros((rounded(n) if n > len(bodies) else n, 6))
         for body, rows in zip(bodies, row, strict=True):
             if body.pose is not None:
                 table[np.unique(rows)] = body.pose

@@ -2,6 +2,8 @@
 
 Poses are 6-vectors (turn, shift): a rotation vector (rad) and a translation (m) that map the second
 frame of their name into the first. Static bodies have one row, moving ones a row for each epoch.
+Where bodies move, spare rows follow, and so they do after the points: recordings of similar size
+are the same program.
 """
 
 import math

@@ -120,7 +120,7 @@ class Tables:
                 continue
             real = len(chosen)
             tables.append(chosen)
-            chosen = np.append(chosen, np.full(rounded(real) - real, chosen[-1]))
+            chosen = _padded(chosen)
             camera, target = obs.camera[chosen], obs.target[chosen]
             epoch, point = obs.epoch[chosen], self.first_point[target] + obs.point[chosen]
             slots = [
@@ -160,27 +160,33 @@ class Tables:
         ranges = self.recording.ranges
         if ranges is None or len(ranges.epoch) == 0:
             return None
-        to_plane = ranges.point < 0
-        point = self.first_point[ranges.target] + np.maximum(ranges.point, 0)
-        station = self.station_of_finder[ranges.rangefinder]
+        real = len(ranges.epoch)
+        chosen = _padded(np.arange(real))
+        n, epoch, target = len(chosen), ranges.epoch[chosen], ranges.target[chosen]
+        finder, mark = ranges.rangefinder[chosen], ranges.point[chosen]
+        point, station = (
+            self.first_point[target] + np.maximum(mark, 0),
+            self.station_of_finder[finder],
+        )
         slots = [
-            self.layout.slots("station_from_rangefinder", ranges.rangefinder),
-            self.layout.slots("world_from_station", self.station_row[station, ranges.epoch]),
-            self._carriers(ranges.target, ranges.epoch),
-            self.layout.slots("carrier_from_target", self.target_row[ranges.target, ranges.epoch]),
+            self.layout.slots("station_from_rangefinder", finder),
+            self.layout.slots("world_from_station", self.station_row[station, epoch]),
+            self._carriers(target, epoch),
+            self.layout.slots("carrier_from_target", self.target_row[target, epoch]),
             self.layout.slots("point", point),
         ]
-        n = len(ranges.epoch)
+        placed = self._placed(station, target, epoch) & (np.arange(n) < real)
         return RangeFactor(
+            real=jnp.asarray(real),
             slots=jnp.asarray(np.concatenate(slots, axis=1)),
-            sigma=jnp.asarray(ranges.sigma[:, None]),
-            weight=jnp.asarray(self._placed(station, ranges.target, ranges.epoch), float),
+            sigma=jnp.asarray(ranges.sigma[chosen, None]),
+            weight=jnp.asarray(placed, float),
             circumstances=self.circumstances(
-                ranges.epoch, ranges.target, point, np.zeros((n, 2)), np.ones(n), np.full(n, np.nan)
+                epoch, target, point, np.zeros((n, 2)), np.ones(n), np.full(n, np.nan)
             ),
-            to_plane=jnp.asarray(to_plane, float),
-            measured=jnp.asarray(ranges.distance),
-            view=jnp.asarray(self.channels.view(0, ranges.epoch)),
+            to_plane=jnp.asarray(mark < 0, float),
+            measured=jnp.asarray(ranges.distance[chosen]),
+            view=jnp.asarray(self.channels.view(0, epoch)),
             pattern=jnp.zeros((n, 0)),
         )
 
@@ -310,6 +316,11 @@ class Tables:
             weight=jnp.ones(len(flat)),
             expected=jnp.asarray(np.concatenate(expected)),
         )
+
+
+def _padded(rows: Int[np.ndarray, " real"]) -> Int[np.ndarray, " observations"]:
+    """Rows of a table, the last one again and again up to a round number."""
+    return np.append(rows, np.full(rounded(len(rows)) - len(rows), rows[-1]))
 
 
 def information_root(covariance: Float[np.ndarray, "n 6 6"]) -> Float[np.ndarray, "n 6 6"]:

@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 
 from jaxvm.geometry.lenses import lens_family
 from jaxvm.network.state import Layout
+from jaxvm.physics.blocks import rounded
 from jaxvm.physics.forms import FORMS
 
 if TYPE_CHECKING:
@@ -82,6 +83,7 @@ def arrange(
     label: tuple[str, ...],
     idle: Int[np.ndarray, " idle"],
     momentary: Int[np.ndarray, " momentary"],
+    spare: bool,
 ) -> Unknowns:
     """Order the free parameters.
 
@@ -93,6 +95,7 @@ def arrange(
         label: names.
         idle: positions that are free in form only.
         momentary: positions of poses and amplitudes of one epoch.
+        spare: whether there are empty groups up to a round number.
     """
     leads = free & (tie == np.arange(len(free)))
     shared = np.flatnonzero(leads & (group < 0))
@@ -101,6 +104,7 @@ def arrange(
     local = local[np.argsort(group[local], kind="stable")]
     member_of = group[local] - group[local].min(initial=len(free))
     n_groups = int(member_of.max(initial=-1)) + 1
+    n_groups = rounded(n_groups) if spare and n_groups else n_groups
     sizes = np.bincount(member_of, minlength=n_groups)
     size = int(sizes.max(initial=0))
     starts = np.concatenate([[0], np.cumsum(sizes)])[:-1].astype(int)
@@ -197,9 +201,11 @@ def free_unknowns(scene: Scene) -> Unknowns:
     release(links, [f"link {k // 6}: {pose_parts[k % 6]}" for k in range(len(links))])
     idle = _release_effects(scene, layout, release, factor, tie)
     group = local_groups(layout, {"epochs": by_epoch, "points": by_point}, free)
+    # Some epochs more or less are no other program; a block of images has points of its own.
+    spare = group is by_epoch
     momentary = np.flatnonzero(free & (by_epoch >= 0))
     momentary = np.append(momentary, layout.all("amplitude")[_amplitudes_of_one_epoch(scene)])
-    return arrange(free, group, tie, factor, tuple(label), idle, momentary)
+    return arrange(free, group, tie, factor, tuple(label), idle, momentary, spare)
 
 
 def _amplitudes_of_one_epoch(scene: Scene) -> np.ndarray:

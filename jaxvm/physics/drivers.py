@@ -223,20 +223,19 @@ def patterns(
     driver, basis = terms[0].driver, terms[0].basis
     constants = np.array([(*term.constants, 1.0, 1.0)[:2] for term in terms], float)
     (table,) = hosted(drivers)
+    array: Any = np if isinstance(table, np.ndarray) else jnp
     if driver in PLANES:
         x_name, y_name, width = PLANES[driver]
         columns = [OBSERVATION_DRIVER_INDEX[name] for name in (x_name, y_name)]
         x = table[:, np.array(columns)]
         tile, wave = partial(_spots, width=width), partial(_waves, name=basis)
-        evaluate, known = tile if basis == "tile" else wave, jnp.isfinite(x).all(axis=1)
+        evaluate, known = tile if basis == "tile" else wave, array.isfinite(x).all(axis=1)
     else:
         x = table[:, OBSERVATION_DRIVER_INDEX[driver]]
-        evaluate, known = partial(_bases, name=basis), jnp.isfinite(x)
-    (known,) = hosted(known)
+        evaluate, known = partial(_bases, name=basis), array.isfinite(x)
     # Few numbers of terms are few programs.
     values = by_blocks(evaluate, x, roomy(constants, least=1))[:, : len(terms)]
-    where: Any = np.where if isinstance(values, np.ndarray) else jnp.where
-    return where(known[:, None], values, 0.0)
+    return array.where(known[:, None], values, 0.0)
 
 
 @program

@@ -291,7 +291,7 @@ def _against_driver(diagnosis, finding, before, after, shift, fitted) -> Figure:
 
     channels = diagnosis.scene.network.channels
     driver = finding.effect.driver
-    values = np.asarray(channels.values[channels.index(driver)])
+    values = np.asarray(channels.values)[channels.index(driver)]
     x = np.interp(recording.time, np.asarray(channels.time), values)
     label = driver.replace("_", " ")
     time, unit = _readable(recording.time - recording.time[0])

@@ -10,7 +10,7 @@ import numpy as np
 import optimistix as optx
 from jax.sharding import Mesh
 
-from jaxvm.compiling import compile_seconds, program
+from jaxvm.compiling import compile_seconds
 from jaxvm.network.network import Residuals
 from jaxvm.network.residual import residual
 from jaxvm.network.scene import Scene
@@ -101,11 +101,8 @@ class Adjustment:
 
     def residuals(self) -> Residuals:
         """Whitened residuals at the solution, without the padding of the tables."""
-        padded = residual(_state(self.problem, self.x), self.problem.network)
-        pixels = tuple(
-            block[: len(rows)] for block, rows in zip(padded.pixels, self.scene.tables, strict=True)
-        )
-        return padded._replace(pixels=pixels)
+        network = self.problem.network
+        return network.unpadded(residual(self.problem.state(self.x), network))
 
     def summary(self) -> str:
         """A few lines: cost, iterations, why it stopped, where the time went."""
@@ -215,7 +212,7 @@ def _moved(found: Adjustment) -> float:
     """Sum of squared changes of whitened residuals by the patterns at the solution."""
     if not found.scene.effects:
         return 0.0
-    network, state = found.problem.network, _state(found.problem, found.x)
+    network, state = found.problem.network, found.problem.state(found.x)
     anew = network.with_patterns_of(found.scene.network)
     old, new = jax.tree.leaves(residual(state, network)), jax.tree.leaves(residual(state, anew))
     return sum(
@@ -247,7 +244,7 @@ def _adjusted(
         problem = eqx.tree_at(
             lambda p: p.network.ranges.weight,
             problem,
-            replace_fn=lambda own: own * jnp.asarray(range_weights),
+            replace_fn=lambda own: own * _filled_up(range_weights, own),
         )
     if link_weights is not None:
         problem = eqx.tree_at(lambda p: p.network.links.weight, problem, jnp.asarray(link_weights))
@@ -283,7 +280,7 @@ def _result(
 ) -> Adjustment:
     """What a minimisation found, whatever the method; the caller knows how long it took."""
     return Adjustment(
-        scene=scene.with_state(_state(problem, x)),
+        scene=scene.with_state(problem.state(x)),
         problem=problem,
         x=x,
         cost_before=float(history[0]) if len(history) else float("nan"),
@@ -343,8 +340,13 @@ def with_weights(problem: Problem, weights: tuple[np.ndarray, ...]) -> Problem:
     """The problem with other weights of the image points, one vector for each pixel table."""
     padded = []
     for factor, own in zip(problem.network.pixels, weights, strict=True):
-        padded.append(jnp.asarray(np.append(own, np.zeros(factor.slots.shape[0] - len(own)))))
+        padded.append(_filled_up(own, factor.weight))
     return eqx.tree_at(lambda p: [f.weight for f in p.network.pixels], problem, padded)
+
+
+def _filled_up(weights: np.ndarray, own) -> jax.Array:
+    """Weights of the observations of a table, zero for its padding."""
+    return jnp.asarray(np.append(weights, np.zeros(len(own) - len(weights))))
 
 
 def degrees_of_freedom(problem: Problem, diagonal) -> int:
@@ -356,11 +358,6 @@ def degrees_of_freedom(problem: Problem, diagonal) -> int:
         int(np.sum(np.asarray(f.weight) > 0)) * f.sigma.shape[1] for f in problem.network.factors()
     )
     return used - int(np.sum(np.asarray(diagonal) > 0))
-
-
-@program
-def _state(problem: Problem, x):
-    return problem.state(x)
 
 
 def _why(last, max_steps) -> str:

@@ -121,8 +121,7 @@ def influence(adjustment: Adjustment, positions: np.ndarray) -> Residuals:
     units[columns[live], live] = np.asarray(problem.factor)[positions[live]]
     steps = np.asarray(_solve(_factors(adjustment), jnp.asarray(units)))[:, : len(columns)]
     weights = _along(problem, adjustment.x, steps)
-    tables = zip(weights.pixels, adjustment.scene.tables, strict=True)
-    return weights._replace(pixels=tuple(block[: len(rows)] for block, rows in tables))
+    return problem.network.unpadded(weights)
 
 
 def _along(problem: Problem, x, steps: Float[np.ndarray, "n k"]) -> Residuals:
@@ -145,8 +144,8 @@ def pose_covariances(
 ) -> Float[np.ndarray, "rows 6 6"]:
     """Covariance of every pose of a table of the state: turn (rad), then shift (m).
 
-    Zero where it is held, NaN where it is free and no observation touches it. The turn is that of
-    the pose's rotation vector.
+    Zero where it is held (spare rows are), NaN where it is free and no observation touches it. The
+    turn is that of the pose's rotation vector.
     """
     problem = adjustment.problem
     layout = problem.network.layout
@@ -162,6 +161,8 @@ def pose_covariances(
         touched = np.asarray(factors.touched)
         for row, own in enumerate(columns):
             live = np.flatnonzero(own < problem.n)
+            if not len(live):
+                continue
             units = np.zeros((problem.n, 6))
             units[own[live], live] = 1.0
             solved = np.asarray(_solve(factors, jnp.asarray(units)))
@@ -185,7 +186,8 @@ def standard_deviations(adjustment: Adjustment, scale: float = 1.0) -> State:
     else:
         factors = _factors(adjustment)
         assert isinstance(factors, ArrowFactors)
-        flat, touched = _marginals(problem, factors), factors.touched
+        touched = factors.touched
+        flat = _marginals(problem.column, problem.factor, problem.active, factors)
     unknown = np.append(np.asarray(problem.active) & ~np.asarray(touched), False)
     flat = jnp.where(unknown[np.asarray(problem.column)], jnp.nan, flat)
     return adjustment.problem.network.layout.restore(jnp.sqrt(scale) * flat)
@@ -205,9 +207,9 @@ def effect_deviations(adjustment: Adjustment) -> list[tuple[float, ...]]:
 
 
 @program
-def _marginals(problem: Problem, factors: ArrowFactors):
+def _marginals(column, factor, active, factors: ArrowFactors):
     """Square roots of the diagonal of H^-1, in the units of the parameters."""
-    s, groups, d = problem.sizes
+    s, groups, d = factors.arrow.sizes
     shared = jnp.linalg.inv(factors.reduced) if s else jnp.zeros((0, 0))
     half = jax.vmap(jnp.linalg.inv)(factors.local) if groups else jnp.zeros((0, d, d))
     # V^-1 and its correction V^-1 W S^-1 W^T V^-1 through the shared unknowns.
@@ -215,6 +217,6 @@ def _marginals(problem: Problem, factors: ArrowFactors):
     through = jnp.einsum("gas,ts->gat", spread, shared)
     local = jnp.sum(half**2, axis=1) + jnp.sum(through**2, axis=2)
     variance = jnp.concatenate([jnp.sum(shared**2, axis=0), jnp.ravel(local), jnp.zeros(1)])
-    active = jnp.concatenate([problem.active, jnp.zeros(1, bool)])
+    active = jnp.concatenate([active, jnp.zeros(1, bool)])
     variance = jnp.where(active, variance, 0.0)
-    return jnp.abs(problem.factor) * jnp.sqrt(variance[problem.column])
+    return jnp.abs(factor) * jnp.sqrt(variance[column])
