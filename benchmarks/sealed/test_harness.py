@@ -11,11 +11,11 @@ from names import Facts, same_name, same_place
 from power import facts_of, plain_fit, shown, whitened
 from scipy.integrate import solve_ivp
 from tally import odds_of_noise, wilson
-from world import EFFECTS, heat
+from world import EFFECTS, heat, record
 from world.effect import Site
 
 from jaxvm.discover.cells import arrange
-from jaxvm.recording import read_recording
+from jaxvm.recording import join, read_recording
 from jaxvm.simulate import simulate_deformation_scene
 
 
@@ -289,3 +289,27 @@ def test_a_tilted_sensor_keeps_lines_straight_and_cross_ratios():
         return (c - a) * (d - b) / ((c - b) * (d - a))
 
     assert cross_ratio(*along) == pytest.approx(cross_ratio(*at), rel=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["board", "wide"])
+def test_a_second_camera_shares_the_target_and_not_the_lens(kind, tmp_path):
+    """Of one make, at another place; the recordings with and without it join."""
+    for effect, shared in (("lens-radial-residue", False), ("target-bow", True)):
+        first = record(kind, 5, (effect,))
+        second = record(kind, 5, (effect,), plan="camera")
+        assert len(first.scene.cameras) == 1 and len(second.scene.cameras) == 2
+        sizes = np.abs(second.change["pixels"]).max(axis=1)
+        own, aside = (sizes[second.rows.camera == k].max() for k in (0, 1))
+        # Only shares of a lens's errors differ between the recordings, by the poses of the board.
+        assert own == pytest.approx(np.abs(first.change["pixels"]).max(), rel=0.5)
+        assert aside > 0.3 * own if shared else aside == 0.0
+    one, other = second.scene.cameras
+    middle = np.mean(second.scene.targets[0].shift, axis=0)
+    ways = [middle - camera.shift for camera in (one, other)]
+    angle = np.arccos(ways[0] @ ways[1] / np.prod(np.linalg.norm(ways, axis=1)))
+    assert np.radians(25.0) < angle < np.radians(55.0)
+    for name, made in (("first", first), ("second", second)):
+        made.write(tmp_path / name)
+    both = join(*(read_recording(tmp_path / name) for name in ("first", "second")))
+    assert [camera.name for camera in both.model.cameras] == ["camera", "second"]
+    assert "pose" in both.model.cameras[1].free

@@ -18,6 +18,7 @@ odds l (on the scale of chi-square) a normal variable of variance 4 d and of mea
 finding is right, l - d where the rival is.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, count, islice
@@ -29,8 +30,9 @@ from scipy.special import ndtr
 
 from jaxvm.compiling import program
 from jaxvm.discover.hypotheses import Hypothesis
-from jaxvm.discover.plans import PLANS, Plan, planned, possible
+from jaxvm.discover.plans import PLANS, Plan, Planned, planned, possible
 from jaxvm.discover.rivals import Rival
+from jaxvm.discover.second_camera import of_first_cameras
 from jaxvm.discover.select import decisive_gap
 from jaxvm.network.scene import Scene
 from jaxvm.physics.effects import Effect, room_for
@@ -148,7 +150,7 @@ def advise(
         for another_day in days:
             further = planned(plan, scene, another_day)
             both = [
-                known + _information(_without_priors(batch.under(further.scene)), further.weights)
+                known + batch.information(further)
                 for batch, known in zip(batches, present, strict=True)
             ]
             expected = np.minimum(expected, gaps(both))
@@ -188,7 +190,13 @@ class _Batch:
 
     def under(self, scene: Scene) -> Scene:
         """The same effects under other circumstances."""
-        return scene.with_effects(self.scene.fitted_effects(), self.scene.room)
+        own = of_first_cameras(self.scene.fitted_effects(), self.scene.model, scene.model)
+        return scene.with_effects(own, self.scene.room)
+
+    def information(self, further: Planned) -> np.ndarray:
+        """What a further recording adds to the information on the shared unknowns."""
+        scene = _without_priors(self.under(further.scene))
+        return _on_the_same(_information(scene, further.weights), scene, self.scene)
 
     def drop(self, information: np.ndarray) -> float:
         """What the finding explains and the rest of the model does not."""
@@ -339,6 +347,35 @@ def _information(scene: Scene, weights: tuple[np.ndarray, ...]) -> np.ndarray:
     """Normal matrix of the shared unknowns, in plain increments, momentary ones eliminated."""
     problem = with_weights(scene_problem(scene), weights)
     return np.asarray(_reduced(normal_at(problem, jnp.zeros(problem.n)).hessian))
+
+
+def _on_the_same(information: np.ndarray, scene: Scene, first: Scene) -> np.ndarray:
+    """Information on the shared unknowns of a first scene, of that on those of another one.
+
+    What the other one has besides (a further camera) is eliminated, like momentary poses.
+    """
+    ours, theirs = _numbered(first), _numbered(scene)
+    if ours == theirs:
+        return information
+    place = {name: k for k, name in enumerate(theirs)}
+    own = np.array([place[name] for name in ours], int)
+    rest = np.setdiff1d(np.flatnonzero(np.diag(information) > 0.0), own)
+    scale = 1.0 / np.sqrt(np.diag(information)[rest])
+    block = scale[:, None] * information[np.ix_(rest, rest)] * scale
+    cross = scale[:, None] * information[np.ix_(rest, own)]
+    taken = cross.T @ np.linalg.pinv(block, rcond=1e-10, hermitian=True) @ cross
+    return information[np.ix_(own, own)] - taken
+
+
+def _numbered(scene: Scene) -> list[tuple[str, int]]:
+    """Names of the shared unknowns; those of one name (spare ones) are told apart by a number."""
+    names = scene.unknowns.names()[: scene.unknowns.n_shared]
+    seen: Counter[str] = Counter()
+    found = []
+    for name in names:
+        found.append((name, seen[name]))
+        seen[name] += 1
+    return found
 
 
 @program

@@ -1,8 +1,8 @@
 """Plans: further recordings that could be made with the same cameras and bodies.
 
-A plan changes what an engineer can change (distance, attitude, motion, temperature, power) in a
-recording that was made, and predicts the images with the fitted model. Nothing is measured here;
-what the plan would decide is computed from its geometry alone.
+A plan changes what an engineer can change (distance, attitude, motion, temperature, power, a second
+camera) in a recording that was made, and predicts the images with the fitted model. Nothing is
+measured here; what the plan would decide is computed from its geometry alone.
 """
 
 from collections.abc import Callable
@@ -14,6 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from jaxvm.discover.second_camera import (
+    may_have_second_camera,
+    of_first_cameras,
+    with_second_camera,
+)
 from jaxvm.geometry.lenses import lens_family
 from jaxvm.network.residual import predict_pixels
 from jaxvm.network.scene import Scene, build
@@ -40,12 +45,14 @@ class Plan:
         poses: changes the poses [targets, epochs, 6] of the targets that move, from the middles of
             their marks (target coordinates), the eye that sees them and the upward direction.
         recording: changes the circumstances (drivers, velocities, power).
+        scene: changes with what is measured; the fitted scene without its effects.
     """
 
     key: str
     words: str
     poses: Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray] | None = None
     recording: Callable[[Recording], Recording] | None = None
+    scene: Callable[[Scene], Scene] | None = None
 
 
 @dataclass(frozen=True)
@@ -208,6 +215,11 @@ PLANS: tuple[Plan, ...] = (
     Plan("reverse", "the motion the other way and twice as fast", recording=_reversed),
     Plan("restart", "the cameras switched off and on again in the middle", recording=_restarted),
     Plan("longer", "the same for twice as long", recording=_longer),
+    Plan(
+        "camera",
+        "a second camera that sees the same from 40 degrees to the side",
+        scene=with_second_camera,
+    ),
 )
 """Further recordings that are weighed, in the order of their cost."""
 
@@ -216,6 +228,8 @@ def possible(plan: Plan, recording: Recording) -> bool:
     """Whether a plan can be made with what a recording has."""
     if plan.poses is not None:
         return any(map(_moves, recording.model.targets))
+    if plan.key == "camera":
+        return may_have_second_camera(recording)
     if plan.key == "cycle":
         return recording.drivers is not None and any(map(_warms, recording.drivers.channels))
     if plan.key == "reverse":
@@ -241,21 +255,11 @@ def planned(plan: Plan, scene: Scene, another_day: bool = False) -> Planned:
         another_day: what went on with time has gone on since the first recording; otherwise its
             clock starts anew.
     """
-    recording = scene.recording
-    if plan.recording is not None:
-        recording = plan.recording(recording)
-    changed = build(recording, ())
-    state = scene.state
-    if plan.poses is not None:
-        state = _with_poses(plan, scene)
-    blank = changed.state
-    state = eqx.tree_at(
-        lambda s: (s.amplitude, s.constant), state, (blank.amplitude, blank.constant)
-    )
-    changed = replace(changed, state=state)
+    changed = _changed(plan, scene) if plan.scene is None else plan.scene(scene)
     if another_day:
         changed = _on_another_day(changed)
-    changed = changed.with_effects(scene.fitted_effects(), scene.room)
+    effects = of_first_cameras(scene.fitted_effects(), scene.model, changed.model)
+    changed = changed.with_effects(effects, scene.room)
     tables = zip(changed.tables, predict_pixels(changed.state, changed.network), strict=True)
     nearest = _nearest(scene)
     weights = [
@@ -263,6 +267,20 @@ def planned(plan: Plan, scene: Scene, another_day: bool = False) -> Planned:
         for rows, pixels in tables
     ]
     return Planned(changed, tuple(weights))
+
+
+def _changed(plan: Plan, scene: Scene) -> Scene:
+    """The fitted values under the circumstances and at the poses of a plan, without effects."""
+    recording = scene.recording
+    if plan.recording is not None:
+        recording = plan.recording(recording)
+    changed = build(recording, ())
+    state = scene.state if plan.poses is None else _with_poses(plan, scene)
+    blank = changed.state
+    state = eqx.tree_at(
+        lambda s: (s.amplitude, s.constant), state, (blank.amplitude, blank.constant)
+    )
+    return replace(changed, state=state)
 
 
 def _on_another_day(scene: Scene) -> Scene:

@@ -15,7 +15,8 @@ def join(first: Recording, second: Recording) -> Recording:
     """Both recordings as one with two sessions.
 
     Cameras, rangefinders and bodies of one name are the same; what is static stayed where it was,
-    what moves per epoch goes on. The second recording keeps its clock where that is later, and
+    what moves per epoch goes on. The second recording may have further cameras after those of the
+    first, and further stations. The second recording keeps its clock where that is later, and
     follows after a pause otherwise. Of the drivers, those that both have are kept; a link that both
     have counts once. That there were two sessions is not kept in a file.
 
@@ -29,12 +30,16 @@ def join(first: Recording, second: Recording) -> Recording:
     if second.drivers is not None:
         begins = min(begins, second.drivers.time[0])
     later = 0.0 if begins > ends else ends + PAUSE_S - begins
+    # A further camera was never on before.
+    before = {camera.name: camera.powered_on_s for camera in first.model.cameras}
     cameras = tuple(
         replace(
-            a,
-            powered_on_s=tuple(sorted({*a.powered_on_s, *(m + later for m in b.powered_on_s)})),
+            camera,
+            powered_on_s=tuple(
+                sorted({*before.get(camera.name, ()), *(m + later for m in other.powered_on_s)})
+            ),
         )
-        for a, b in zip(model.cameras, second.model.cameras, strict=True)
+        for camera, other in zip(model.cameras, second.model.cameras, strict=True)
     )
     velocities = {
         name: np.concatenate([_velocity(first, name), _velocity(second, name)])
@@ -44,7 +49,8 @@ def join(first: Recording, second: Recording) -> Recording:
         model=replace(
             model,
             cameras=cameras,
-            stations=_in_each_epoch(first, second, "stations"),
+            stations=_in_each_epoch(first, second, "stations")
+            + model.stations[len(first.model.stations) :],
             targets=_in_each_epoch(first, second, "targets"),
         ),
         epoch_ids=np.concatenate(
@@ -62,19 +68,36 @@ def join(first: Recording, second: Recording) -> Recording:
 
 
 def _common(first: Model, second: Model) -> Model:
+    """The first model, with the further cameras of the second one."""
     kinds = ("cameras", "stations", "targets", "rangefinders")
-    if other := other_bodies(first, second, kinds):
+    n, m = len(first.cameras), len(first.stations)
+    same = replace(second, cameras=second.cameras[:n], stations=second.stations[:m])
+    if other := other_bodies(first, same, kinds):
         raise ValueError(
             f"the second recording can't be joined: {other}; give one of the same bodies, in the "
             "same order"
         )
-    return first
+    cameras, stations = second.cameras[n:], second.stations[m:]
+    for station in stations:
+        if station.pose is not None and station.pose.ndim > 1:
+            raise ValueError(
+                f'the second recording can\'t be joined: its further station "{station.name}" has '
+                "a pose for each of its epochs, and none for those of the first; give it one pose"
+            )
+    further = tuple(f"cameras.{camera.name}." for camera in cameras)
+    priors = tuple(prior for prior in second.priors if prior.parameter.startswith(further))
+    return replace(
+        first,
+        cameras=(*first.cameras, *cameras),
+        stations=(*first.stations, *stations),
+        priors=(*first.priors, *priors),
+    )
 
 
 def _in_each_epoch(first: Recording, second: Recording, kind: str) -> tuple:
     """Bodies of the first recording, with the poses of both where they are given in each epoch."""
     bodies = []
-    for a, b in zip(getattr(first.model, kind), getattr(second.model, kind), strict=True):
+    for a, b in zip(getattr(first.model, kind), getattr(second.model, kind), strict=False):
         if a.pose is not None and b.pose is not None and max(a.pose.ndim, b.pose.ndim) > 1:
             own, other = (
                 np.broadcast_to(body.pose, (len(recording.time), 6))

@@ -2,6 +2,9 @@
 
 import numpy as np
 
+EVERY_CAMERA = range(99)
+"""Also those that only a plan has."""
+
 
 def cameras_mask(view, cameras):
     return np.isin(view.rows.camera, cameras)

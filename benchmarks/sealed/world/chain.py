@@ -191,7 +191,7 @@ def to_camera(scene, rows, view, hooks, world):
 
 
 def all_rows(scene, margin=6.0):
-    """Every mark that falls into an image, is turned to the camera and not too oblique."""
+    """Every mark that falls into an image."""
     epochs = len(scene.t)
     parts = []
     for camera, target in scene.sees:
@@ -210,7 +210,24 @@ def all_rows(scene, margin=6.0):
     view = look(scene, rows)
     size = np.array([camera.size for camera in scene.cameras])[rows.camera]
     inside = ((view.pixel > margin) & (view.pixel < size - 1 - margin)).all(axis=1)
-    return rows.where(inside & (view.seen[:, 2] > 0.02))
+    seen = inside & (view.seen[:, 2] > 0.02)
+    return rows.where(seen & _from_the_front(scene, rows, view))
+
+
+def _from_the_front(scene, rows, view):
+    """Whether a mark is seen from the side of its target that the first camera sees.
+
+    The scenes turn their targets to the cameras that they have; a second one stands anywhere.
+    """
+    if scene.plan != "camera":
+        return np.ones(len(rows), bool)
+    normal = view.turn[:, :, 2]
+    cosine = []
+    for camera in scene.cameras:
+        way = view.world - camera.shift
+        cosine.append(np.sum(normal * way, axis=1) / np.linalg.norm(way, axis=1))
+    own = np.choose(rows.camera, cosine)
+    return own * np.sign(cosine[0]) > np.cos(np.radians(80.0))
 
 
 @dataclass

@@ -50,7 +50,8 @@ def _camera(scene, camera):
     if held and known["lens"] != "pinhole":
         lines += [f"distortion = {_list(camera.brown)}"]
     free = ", ".join(f'"{name}"' for name in known.get("free", []))
-    lines += [_pose(camera), f"free = [{free}]"]
+    pose = known.get("pose", (camera.turn, camera.shift))
+    lines += [_pose_of(*pose), f"free = [{free}]"]
     if scene.tells_power:
         again = [] if scene.restart_s is None else [f"{scene.restart_s:.1f}"]
         lines += [f"powered_on_s = [{', '.join([f'{camera.on_s:.1f}', *again])}]"]

@@ -1,5 +1,7 @@
 """Scenes on a bench: a board moved by hand before one camera, of a normal or a wide lens."""
 
+import copy
+
 import numpy as np
 
 from .bodies import Camera, Scene, Station, Target
@@ -139,4 +141,36 @@ def _bench(kind, seed, plan, size, rng, camera, layout, distances, fill_tilt, lo
     scene.weather = make_weather(
         weather, scene.cameras, scene.targets, t[-1], "room", plan, CHANNELS[:3], break_s
     )
+    if plan == "camera":
+        _set_aside(scene)
     return scene
+
+
+def _set_aside(scene):
+    """A second camera of the same make, 40 degrees to the side, on a tripod of its own.
+
+    It is as warm as the first one. Where it stands is guessed to a few degrees.
+    """
+    (camera,), (board,) = scene.cameras, scene.targets
+    rng = stream(scene.kind, scene.seed, "second camera")
+    middle = np.mean(board.shift + board.turn @ board.points.mean(axis=0), axis=0)
+    about = matrix(np.radians(40.0 + rng.normal(0.0, 3.0)) * scene.up)
+    second = copy.deepcopy(camera)
+    second.name, second.station = "second", 1
+    second.focal = camera.focal * (1.0 + rng.normal(0.0, 0.003))
+    second.centre = 0.5 * np.array(camera.size) - 0.5 + rng.normal(0.0, 8.0, 2)
+    if camera.brown is not None:
+        second.brown = camera.brown * (1.0 + rng.normal(0.0, 0.05, 5))
+    second.turn = about @ matrix(rng.normal(0.0, 0.02, 3)) @ camera.turn
+    second.shift = middle + about @ (camera.shift - middle)
+    guess = matrix(rng.normal(0.0, 0.03, 3)) @ second.turn
+    off = 0.03 * np.linalg.norm(middle - second.shift) * rng.normal(size=3)
+    second.known["free"] = [*camera.known["free"], "pose"]
+    second.known["pose"] = guess, second.shift + off
+    scene.cameras.append(second)
+    scene.stations.append(Station("tripod", np.eye(3), np.zeros(3)))
+    scene.sees.append((1, 0))
+    scene.priors += [("second", *prior[1:]) for prior in scene.priors if prior[0] == camera.name]
+    weather = scene.weather
+    for name in ("nodes", "on", "since"):
+        setattr(weather, name, np.repeat(getattr(weather, name), 2, axis=0))

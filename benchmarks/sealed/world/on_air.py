@@ -107,8 +107,7 @@ def _(site):
         path = np.sqrt(np.linalg.norm(view.ray, axis=1) / 100.0)
         return np.stack([u, v], axis=1) * (path / np.sqrt(3.0))[:, None]
 
-    everywhere = range(len(site.scene.cameras))
-    hooks = acts.on_image(everywhere, field, course)
+    hooks = acts.on_image(acts.EVERY_CAMERA, field, course)
     where = {"camera": [c.name for c in site.scene.cameras]}
     return site.draft(hooks, 1e-6, 3e-5, course, {}, where)
 

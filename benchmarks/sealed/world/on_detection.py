@@ -4,24 +4,24 @@ import numpy as np
 
 from . import acts, courses, lens, spots
 from .effect import effect
-from .rotation import apply
+from .rotation import apply, back
 
 
 @effect("circles-are-ellipses", (65,), "wsv", "target")
 def _(site):
     """The centroid of the image of a disc is not the image of its centre."""
-    scene, target = site.scene, site.target
+    target = site.target
     angle = 2.0 * np.pi * np.arange(16) / 16
     rim = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
     course = courses.constant()
 
     def centroid(view, camera, mine, radius):
-        station = scene.stations[scene.cameras[camera].station]
-        axes = scene.cameras[camera].turn.T @ station.turn.T @ view.turn[mine]
+        own = view.scene.cameras[camera]
+        axes = own.turn.T @ view.scene.stations[own.station].turn.T @ view.turn[mine]
         arms = apply(axes[:, None], radius * rim[None])
         points = (view.seen[mine][:, None] + arms).reshape(-1, 3)
-        image = lens.image(view.scene.cameras[camera], points).reshape(-1, 16, 2)
-        centre = lens.image(view.scene.cameras[camera], view.seen[mine])
+        image = lens.image(own, points).reshape(-1, 16, 2)
+        centre = lens.image(own, view.seen[mine])
         x, y = np.moveaxis(image - centre[:, None], -1, 0)
         xn, yn = np.roll(x, -1, axis=1), np.roll(y, -1, axis=1)
         part = x * yn - xn * y
@@ -99,8 +99,7 @@ def _(site):
         way = np.stack([np.cos(angle), np.sin(angle)], axis=1)
         return way * (view.rows.target == target)[:, None]
 
-    everywhere = range(len(site.scene.cameras))
-    hooks = acts.on_image(everywhere, field, light, "detect")
+    hooks = acts.on_image(acts.EVERY_CAMERA, field, light, "detect")
     return site.draft(hooks, 5e-3, 0.3, light, {}, site.at_target())
 
 
@@ -168,10 +167,11 @@ def _(site):
     def field(view, uv):
         r, c = np.divmod(view.rows.point, columns)
         sign = np.where((r + c) % 2 == 0, 1.0, -1.0)
-        way = (view.turn @ diagonal)[:, :2]
+        camera = np.array([camera.turn for camera in view.scene.cameras])[view.rows.camera]
+        way = back(camera, view.turn @ diagonal)[:, :2]
         return sign[:, None] * way / np.linalg.norm(way, axis=1)[:, None]
 
-    hooks = acts.on_image([0], field, course, "detect")
+    hooks = acts.on_image(acts.EVERY_CAMERA, field, course, "detect")
     return site.draft(hooks, 0.01, 0.8, course, {}, site.at_target())
 
 

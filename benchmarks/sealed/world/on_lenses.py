@@ -207,7 +207,7 @@ def _(site):
         mine = (view.rows.target == target) & other[np.minimum(view.rows.point, count - 1)]
         return xy * mine[:, None]
 
-    hooks = acts.on_image(range(len(site.scene.cameras)), field, course)
+    hooks = acts.on_image(acts.EVERY_CAMERA, field, course)
     return site.draft(hooks, 3e-5, 2e-3, course, {}, site.at_target())
 
 

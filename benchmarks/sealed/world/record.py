@@ -23,7 +23,10 @@ from .far import relay, station, stereo
 from .near import board, wide
 from .streams import stream
 
-PLANS = ("nearer", "farther", "roll", "tilt", "cycle", "reverse", "field", "restart", "longer")
+PLANS = (
+    *("nearer", "farther", "roll", "tilt", "cycle", "reverse", "field", "restart", "longer"),
+    "camera",
+)
 SCENES = {"board": board, "wide": wide, "station": station, "stereo": stereo, "relay": relay}
 STAGES = (on_targets, on_air, on_mounts, on_lenses, on_sensors, on_detection, on_ranges, strange)
 STRENGTH = (40.0, 40_000.0)
