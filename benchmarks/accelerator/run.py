@@ -134,7 +134,7 @@ def relay(stations: int) -> dict:
 def scoring(epochs: int, hypotheses: int) -> dict:
     """Hypotheses scored on the deformation scene: tangents on the device, products on the host."""
     benchmark = of("scoring", "run.py")
-    benchmark.ROUNDS, benchmark.REFITS = 1, 3
+    benchmark.ROUNDS, benchmark.REFITS = 2, 1
     found = benchmark.one(epochs, [hypotheses])
     row = next(row for row in found["rows"] if not row["flips"])
     return {
