@@ -50,6 +50,9 @@ from jaxvm.solve.adjust import Adjustment
 _STACKED = 32
 """Terms whose tangents are multiplied at a time, of as many groups as have them."""
 
+_THREADS = min(os.cpu_count() or 1, 4)
+"""More wait for Python's interpreter between their products: sixteen take longer than two."""
+
 _MOST_KEPT = 30_000_000
 """Numbers that are kept of what shared unknowns see of all hypotheses: 240 MB."""
 
@@ -142,7 +145,7 @@ class ScoreTests:
         tested = _Tested.of(cells, e, variance, signs)
         scores = tuple(_unscored(f, tested) for f in self.battery.families)
         # NumPy lets other threads run while it multiplies.
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
+        with ThreadPoolExecutor(_THREADS) as pool:
             groups = (g for family in self.battery.families for g in family.groups)
             self.tangents.evaluate(groups, pool)
             for _ in pool.map(lambda own: self._score_groups(own, tested, scores), self._batches()):
