@@ -206,6 +206,29 @@ def test_a_rival_may_have_all_terms_of_its_name(stereo):
     assert own == [further, SHIFT]
 
 
+def test_a_name_may_stand_for_other_terms():
+    """A distortion that changes with the range may enter with the radius or without."""
+    by_id = {entry.id: entry for entry in CATALOGUE}
+
+    def named(entry: str, *terms: Term) -> Hypothesis:
+        return replace(FOCAL, group=Group(terms, "camera"), entries=(by_id[entry],))
+
+    slanted = named("distortion-with-range", Term("sensor.focal", "inverse_range", "linear"))
+    assert {h.group.terms for h in slanted.instead()} == {
+        (Term("lens.k1", "inverse_range", "linear"),),
+        (Term("sensor.focal", "radius2_over_range", "linear"),),
+    }
+    assert under_its_name(slanted, (SHIFT,))[-1] == SHIFT
+    # What turned may have shifted: three axes at once, beside those that it lacks itself.
+    turned = named("pair-calibration", Term("mount.turn_x"))
+    (shifted,) = turned.instead()
+    assert {term.port for term in shifted.group.terms} == {f"mount.shift_{a}" for a in "xyz"}
+    # A wave of another length is the same kind of physics.
+    waves = by_id["range-cyclic"]
+    assert named("range-cyclic", *waves.groups[0]).instead() == []
+    assert SHIFT.instead() == []
+
+
 def test_a_rival_may_have_constants_of_its_own(stereo):
     """The same effect with another time constant is told from it by no recording."""
 

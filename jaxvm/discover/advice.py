@@ -165,10 +165,11 @@ def advise(
 
 
 def under_its_name(hypothesis: Hypothesis, others: Iterable[Hypothesis]) -> list[Hypothesis]:
-    """What may be found under the same name once more is recorded: further terms, other drivers."""
+    """What may be found under the same name once more is recorded: further terms, other drivers,
+    other terms altogether."""
     each = (hypothesis, *others)
     remainders = [further for own in each if (further := own.remainder())]
-    return [*remainders[:1], *others, *remainders[1:]]
+    return [*remainders[:1], *hypothesis.instead(), *others, *remainders[1:]]
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,9 @@ from jaxvm.physics.ports import PORTS
 FREE = 8
 """A hypothesis with more columns than this is a free form: a curve or a map."""
 
+_FEW = 3
+"""So many other groups of terms a name may have to be asked what else it may stand for."""
+
 _UNEVEN = 4.0
 """Ratio of two neighbouring steps of a grid from which the wider one is a gap in it."""
 
@@ -164,6 +167,21 @@ class Hypothesis:
         fullest = max((terms for terms in alike if len(terms) <= FREE), key=len, default=())
         further = tuple(term for term in fullest if term not in own)
         return replace(self, group=replace(self.group, terms=further)) if further else None
+
+    def instead(self) -> list["Hypothesis"]:
+        """What else its name may stand for: the fullest groups without any of these terms.
+
+        Distortion that depends on the range may enter with the radius or without. None where there
+        are many (waves of any length, seams anywhere): they differ by a constant, and not by kind.
+        """
+        further = self.remainder()
+        known = {*self.group.terms, *(further.group.terms if further else ())}
+        found = []
+        for terms in sorted((g for e in self.entries[:1] for g in e.groups), key=len, reverse=True):
+            if len(terms) <= FREE and not known & {*terms}:
+                found.append(replace(self, group=replace(self.group, terms=terms)))
+                known |= {*terms}
+        return found if len(found) <= _FEW else []
 
     def effect(self, amplitudes) -> Effect:
         """The hypothesis as an effect with given amplitudes."""
