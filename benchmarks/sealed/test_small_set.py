@@ -2,8 +2,8 @@
 
 The world (benchmarks/sealed/world) is plain numpy, written from the physics. What a recording can
 show is told by the world's own estimate of the part that survives the adjustment ("visible"). The
-full benchmark makes sets of hundreds (benchmarks/sealed/make.py). The seed was new when these bounds
-were set, and no engine was changed for it.
+full benchmark makes sets of hundreds (benchmarks/sealed/make.py). The seed was new when it was put
+here: no engine was changed for it.
 """
 
 import json
