@@ -266,11 +266,7 @@ class _Batch:
         diagonal = np.diag(information)
         other = np.array([k for k in np.flatnonzero(diagonal > 0.0) if k not in absent], int)
         columns = np.array(self._columns(own), int)
-        scale = 1.0 / np.sqrt(diagonal[other])
-        block = scale[:, None] * information[np.ix_(other, other)] * scale
-        cross = scale[:, None] * information[np.ix_(other, columns)]
-        explained = cross.T @ np.linalg.pinv(block, rcond=1e-10, hermitian=True) @ cross
-        return information[np.ix_(columns, columns)] - explained
+        return _eliminated(information, columns, other)
 
 
 def _square(vector: np.ndarray, matrix: np.ndarray) -> float:
@@ -361,6 +357,11 @@ def _on_the_same(information: np.ndarray, scene: Scene, first: Scene) -> np.ndar
     place = {name: k for k, name in enumerate(theirs)}
     own = np.array([place[name] for name in ours], int)
     rest = np.setdiff1d(np.flatnonzero(np.diag(information) > 0.0), own)
+    return _eliminated(information, own, rest)
+
+
+def _eliminated(information: np.ndarray, own: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    """Information on some unknowns, of that on all, with others eliminated."""
     scale = 1.0 / np.sqrt(np.diag(information)[rest])
     block = scale[:, None] * information[np.ix_(rest, rest)] * scale
     cross = scale[:, None] * information[np.ix_(rest, own)]

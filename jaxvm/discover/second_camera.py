@@ -109,9 +109,12 @@ def _aside(scene: Scene) -> tuple[Float[np.ndarray, "6"], Bool[np.ndarray, " obs
     attitude = carried * Rotation.from_rotvec(mounted[:3])
     eye = carried.apply(mounted[3:]) + station[3:]
     middle = np.median(mark, axis=0)
-    upright = attitude.as_matrix()[:, 1]
+    sight = (middle - eye) / np.linalg.norm(middle - eye)
     up = np.asarray(scene.model.up, float)
-    axis = up if abs(up @ (middle - eye)) < 0.9 * np.linalg.norm(middle - eye) else upright
+    # To the side of a sight along `up` is where the image's sides are.
+    upward = up if abs(up @ sight) < 0.9 else attitude.as_matrix()[:, 1]
+    axis = upward - (upward @ sight) * sight
+    axis /= np.linalg.norm(axis)
 
     def cosines(place):
         way = mark - place

@@ -164,10 +164,8 @@ class Tables:
         chosen = _padded(np.arange(real))
         n, epoch, target = len(chosen), ranges.epoch[chosen], ranges.target[chosen]
         finder, mark = ranges.rangefinder[chosen], ranges.point[chosen]
-        point, station = (
-            self.first_point[target] + np.maximum(mark, 0),
-            self.station_of_finder[finder],
-        )
+        point = self.first_point[target] + np.maximum(mark, 0)
+        station = self.station_of_finder[finder]
         slots = [
             self.layout.slots("station_from_rangefinder", finder),
             self.layout.slots("world_from_station", self.station_row[station, epoch]),

@@ -16,12 +16,13 @@ def join(first: Recording, second: Recording) -> Recording:
 
     Cameras, rangefinders and bodies of one name are the same; what is static stayed where it was,
     what moves per epoch goes on. The second recording may have further cameras after those of the
-    first, and further stations. The second recording keeps its clock where that is later, and
-    follows after a pause otherwise. Of the drivers, those that both have are kept; a link that both
+    first, and further stations; it keeps its clock where that is later, and follows after a pause
+    otherwise. Of the drivers, those that both have are kept; a link that both
     have counts once. That there were two sessions is not kept in a file.
 
     Raises:
-        ValueError: the recordings have other cameras, stations, targets, marks or rangefinders.
+        ValueError: the recordings have other cameras, stations, targets, marks or rangefinders, or
+            a further station is posed in each epoch.
     """
     model = _common(first.model, second.model)
     n = len(first.time)
