@@ -246,8 +246,8 @@ EXPECTED = {  # with the constants 2 and 0.5, written without the package
     "cosine": np.cos(np.pi * X),
     "direction": np.tanh(np.gradient(lagged_by_hand(X, T, 0.5), T / 3600.0) / 2.0),
     "doubling": 2.0 ** (X / 2.0),
-    "turned": X * np.cos(np.pi * T),
-    "turned aside": X * np.sin(np.pi * T),
+    "turned": lagged_by_hand(X, T, 0.5) * np.cos(np.pi * T),
+    "turned aside": lagged_by_hand(X, T, 0.5) * np.sin(np.pi * T),
     "aged": X * np.array([0, 1 / 6, 1 / 2, 2 / 3, 1, 2]),  # hours
     "first state": np.exp(-(T - T[0]) / 2),
     "decay": np.exp(-np.maximum(X, 0.0) / 2),

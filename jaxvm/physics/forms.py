@@ -72,6 +72,11 @@ def bump(x: Course, centre: Float[Array, ""], width: Float[Array, ""]) -> Course
     return jnp.where(s < 1.0, inner, jnp.where(s < 2.0, outer, 0.0))
 
 
+def _angle(t: Course, period: Float[Array, ""]) -> Course:
+    """Angle (rad) by which a direction has turned since the beginning."""
+    return 2.0 * jnp.pi * (t - t[0]) / period
+
+
 N_KNOTS = {"curve": 12, "fine curve": 30}
 """Cubic B-splines of a free-form curve, and of one that follows faster changes."""
 
@@ -104,8 +109,8 @@ BASES: dict[str, Callable[[Course, Course, Constants], Course]] = {
     "decay": lambda x, t, c: jnp.exp(-jnp.maximum(x, 0.0) / c[0]),
     "staircase": lambda x, t, c: c[0] * (jnp.round(x / c[0] - c[1]) + c[1]),
     "doubling": lambda x, t, c: jnp.exp2(jnp.clip(x / c[0], -30.0, 30.0)),
-    "turned": lambda x, t, c: x * jnp.cos(2.0 * jnp.pi * (t - t[0]) / c[0]),
-    "turned aside": lambda x, t, c: x * jnp.sin(2.0 * jnp.pi * (t - t[0]) / c[0]),
+    "turned": lambda x, t, c: first_order_lag(x, t, c[1]) * jnp.cos(_angle(t, c[0])),
+    "turned aside": lambda x, t, c: first_order_lag(x, t, c[1]) * jnp.sin(_angle(t, c[0])),
     "sine": lambda x, t, c: jnp.sin(2.0 * jnp.pi * x / c[0]),
     "cosine": lambda x, t, c: jnp.cos(2.0 * jnp.pi * x / c[0]),
     "transient": lambda x, t, c: x - first_order_lag(x, t, c[0]),
@@ -344,8 +349,8 @@ FORMS: dict[str, Form] = {
         Form(
             "turning",
             ("turned", "turned aside"),
-            (Constant("period", "s"),),
-            "with {driver}, from a direction that turns",
+            (Constant("period", "s"), _TAU),
+            "following {driver} with a lag, from a direction that turns",
             centred=True,
             sized_by=("turned", "turned aside"),
         ),

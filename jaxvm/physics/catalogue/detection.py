@@ -39,14 +39,14 @@ DETECTION: tuple[Entry, ...] = (
     ),
     Entry(
         "light-bias", "the detector's bias follows the light", (67, 68, 69),
-        _SHIFT, ("irradiance", "light"), ("linear", "lag"), "camera",
+        _SHIFT, ("irradiance", "light"), ("linear", "lag", "lag with state"), "camera",
         (1e-6, 1e-2), "walk of the principal point", "switch a lamp at constant temperature",
         "Brightness, background and shadows move the measured centres of the marks. The shift "
         "follows the light, and not the temperature.",
     ),
     Entry(
         "side-light", "the light on a target biases its marks", (68,),
-        _SHIFT, ("irradiance", "light"), ("linear", "lag", "turning"), "target",
+        _SHIFT, ("irradiance", "light"), ("linear", "lag", "lag with state", "turning"), "target",
         (1e-6, 1e-2), "motion of the target", "shade the target; a lamp from the other side",
         "The sunlit side of each mark is brighter and draws its measured centre. The shift grows "
         "with the light and wanders with the azimuth of the sun.",
@@ -60,15 +60,14 @@ DETECTION: tuple[Entry, ...] = (
     ),
     Entry(
         "dark-current", "dark current draws the dim marks of a target", (70,),
-        _SHIFT, ("temperature", "neighbour"), ("linear", "quadratic", "doubling"), "view",
+        _SHIFT, ("temperature",), ("linear", "quadratic", "doubling"), "view",
         (1e-5, 1e-1), "motion of the target", "cool the sensor; brighter marks",
         "Dark current doubles with every few kelvin and draws the measured centres of dim marks. "
         "The marks of a badly lit target shift together as the sensor warms.",
     ),
     Entry(
         "dark-current-of-marks", "dark current draws each mark by its dimness", (70,),
-        (each("mark", "sensor.cx", "sensor.cy"),), ("temperature", "neighbour"), ("doubling",),
-        "view",
+        (each("mark", "sensor.cx", "sensor.cy"),), ("temperature",), ("doubling",), "view",
         (1e-4, 1.0), "displaced marks", "cool the sensor; brighter marks, all alike",
         "Dark current doubles with every few kelvin and draws the measured centres of dim marks. "
         "Marks that are not equally bright shift unequally, and faster and faster as it warms.",

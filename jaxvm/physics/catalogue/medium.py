@@ -9,6 +9,12 @@ _AIR_FORMS = ("constant", "linear", "proportional", "lag", "lag with state")
 _LAYERS = (Term("medium.layers_up"), Term("medium.layers_up", "image_y", "linear"))
 """Warm air over the ground: rays that pass lower bend more."""
 
+_WALLS = tuple(
+    (Term(f"medium.layers_{axis}"), Term(f"medium.layers_{axis}", "image_x", "linear"))
+    for axis in "xy"
+)
+"""Warm air along a wall: rays that pass nearer bend more."""
+
 _OFF_CENTRE = (plain("sensor.focal"), plain("sensor.focal", "sensor.cx", "sensor.cy"))
 """A weak lens, on the axis of the camera or beside it."""
 
@@ -23,7 +29,7 @@ MEDIUM: tuple[Entry, ...] = (
     ),
     Entry(
         "air-bending-lateral", "the air bends the rays sideways", (17,),
-        pair("medium.layers_x", "medium.layers_y"), _AIR, _AIR_FORMS, "station",
+        (*_WALLS, *pair("medium.layers_x", "medium.layers_y")), _AIR, _AIR_FORMS, "station",
         (1e-10, 1e-5), "yaw of the mount", "watch targets at several ranges",
         "A warm wall, a heater or a sunlit side makes the air warmer on one side of the path. "
         "Rays bend away from the warm side, by the square of the distance.",

@@ -50,7 +50,7 @@ SENSOR: tuple[Entry, ...] = (
     ),
     Entry(
         "principal-point-sun", "the sun on the housing shifts the image", (51, 82),
-        _CENTRE, ("irradiance",), ("lag", "two lags"), "camera",
+        _CENTRE, ("irradiance",), ("lag", "lag with state", "two lags"), "camera",
         (2e-5, 1e-2), "bias of the detector with the light", "shade the camera",
         "The sun heats the housing above the air and the sensor moves against the lens. The whole "
         "image shifts, later than the sun.",
