@@ -191,8 +191,15 @@ def test_the_body_of_a_camera_is_a_neighbour_of_what_does_not_carry_it():
 
     own = ("quantity", "temperature")
     assert kinds(Scope(camera=("left",))) == kinds(Scope(station=("bar",))) == own
-    assert "neighbour" in kinds(Scope(camera=("right",)))
-    assert "neighbour" in kinds(Scope(station=("other",)))
+    # Another camera is a neighbour on the same station, and nothing on one far away.
+    assert kinds(Scope(camera=("right",))) == kinds(Scope(station=("other",))) == ()
+    together = build(replace(logged_scene().recording, drivers=scene.recording.drivers))
+    right = Scope(camera=("right",))
+    assert kinds_in_scope("quantity", "body_left_degC", right, together) == ("neighbour",)
+    # What a camera sees of a target is as warm as the camera.
+    view = Scope(camera=("left",), target=(scene.model.targets[0].name,))
+    assert kinds(view) == own
+    assert kinds(view, "body_right_degC") == ()
     # Targets are as warm as the air, which is logged.
     target = Scope(target=(scene.model.targets[0].name,))
     assert kinds(target) == ("neighbour",)
@@ -201,7 +208,7 @@ def test_the_body_of_a_camera_is_a_neighbour_of_what_does_not_carry_it():
     assert kinds(target, "body_hull_degC") == own
     difference = "body_left_degC - ambient_degC"
     assert kinds(Scope(station=("bar",)), difference, "difference") == own
-    assert "neighbour" in kinds(Scope(station=("other",)), difference, "difference")
+    assert kinds(Scope(station=("other",)), difference, "difference") == ()
     assert kinds(Scope(), kind="time") == ("time",)
 
 

@@ -62,9 +62,10 @@ def driver_kind(scene: Scene, driver: str) -> str:
 def kinds_in_scope(kind: str, driver: str, scope: Scope, scene: Scene) -> tuple[str, ...]:
     """Kinds of a driver for the bodies of a scope, general ones first.
 
-    The body of a camera is a neighbour of other cameras, of stations that don't carry it, and of
-    targets. Where what is nearer is logged, too (a camera's own body, the air), it is nothing else:
-    physics of a body follows its own temperature, not one like it.
+    The body of a camera is a neighbour of other cameras on its station, and of targets. Where what
+    is nearer is logged, too (a camera's own body, the air), it is nothing else: physics of a body
+    follows its own temperature, not one like it. What happens to a target in one camera's view is
+    physics of that camera.
     """
     if kind not in ("quantity", "difference", "own"):
         return tuple(kind.split(" or "))
@@ -72,14 +73,15 @@ def kinds_in_scope(kind: str, driver: str, scope: Scope, scene: Scene) -> tuple[
     body = camera_of(driver, scene)
     if not body or scope == Scope() or scope.rangefinder:
         return ("quantity", own)
-    if scope.target:
+    if scope.target and not scope.camera:
         return ("neighbour",) if air_is_logged(scene) else ("quantity", own, "neighbour")
     stations = {camera.name: camera.station for camera in scene.model.cameras}
     near = scope.camera or [name for name, at in stations.items() if at in scope.station]
     if body in near:
         return ("quantity", own)
+    beside = ("neighbour",) if stations[body] in {stations[name] for name in near} else ()
     logged = all(f"body_{name}_degC" in scene.network.channels.names for name in near)
-    return ("neighbour",) if logged else ("quantity", own, "neighbour")
+    return beside if logged else ("quantity", own, *beside)
 
 
 def camera_of(driver: str, scene: Scene) -> str:
@@ -166,7 +168,11 @@ def _of_quantity(driver: str, channels: Channels, lags: list[float]) -> list[Cou
         Course(driver, "ageing", (), reference),
         # Over less it is as good as constant.
         *([Course(driver, "doubling", (_DOUBLING,), reference)] if width > 0.5 * _DOUBLING else []),
-        *(Course(driver, "turning", (times * span,), reference) for times in (4.0, 7.0, 15.0)),
+        *(
+            Course(driver, "turning", (times * span, tau), reference)
+            for times in (4.0, 7.0, 15.0)
+            for tau in (_quick(lags)[0], lags[0], lags[2])
+        ),
         *(
             Course(driver, "staircase", (share * width, phase), reference)
             for share, phase in _STAIRS
