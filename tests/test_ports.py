@@ -1,5 +1,6 @@
 """Every port of the chain: its derivative, and its sign and unit against a calculation by hand."""
 
+import itertools
 from dataclasses import dataclass, field
 
 import jax
@@ -427,27 +428,28 @@ def _():
     yield Case(2e-5, (CX, CY + 1.0), far)
 
 
-@hand("medium.dome_x", "rad")
+@hand("medium.dome_x", "m")
 def _():
     yield from through_dome(np.array([1.0, 0.0, 0.0]))
 
 
-@hand("medium.dome_y", "rad")
+@hand("medium.dome_y", "m")
 def _():
     yield from through_dome(np.array([0.0, 1.0, 0.0]))
 
 
-@hand("medium.dome_z", "rad")
+@hand("medium.dome_z", "m")
 def _():
     yield from through_dome(np.array([0.0, 0.0, 1.0]))
 
 
 def through_dome(side):
     # From the pinhole through two spheres about a point c beside it: Snell's law at both, with the
-    # normals from c. A mark far away lies where the ray goes; the port is (1 - 1/n) (1/R - 1/R') c.
-    inner, outer, n, far = 0.07, 0.074, 1.52, 1e6
-    c = 1e-6 * side
-    for x, y in ((0.0, 0.0), (0.3, -0.2), (-0.5, 0.6)):
+    # normals from c. The mark lies on the ray that leaves, near or far.
+    inner, outer, n = 0.07, 0.074, 1.52
+    cases = itertools.product(((0.0, 0.0), (0.3, -0.2), (-0.5, 0.6)), (2e-3, 2e-2), (0.3, 20.0))
+    for (x, y), size, far in cases:
+        c = size * side
         way = np.array([x, y, 1.0]) / np.sqrt(1.0 + x * x + y * y)
         at = np.zeros(3)
         for radius, ratio in ((inner, 1.0 / n), (outer, n)):
@@ -457,9 +459,8 @@ def through_dome(side):
             cosine = way @ normal
             inside = np.sqrt(1.0 - ratio**2 * (1.0 - cosine**2))
             way = ratio * way + (inside - ratio * cosine) * normal
-        mark = Bench(origin=tuple(far * way), point=(0, 0, 0))
-        value = (1.0 - 1.0 / n) * (1.0 / inner - 1.0 / outer) * 1e-6
-        yield Case(value, (CX + F * x, CY + F * y), mark, rtol=1e-3)
+        mark = Bench(origin=tuple(at + far * way), point=(0, 0, 0))
+        yield Case(size, (CX + F * x, CY + F * y), mark, rtol=1e-3)
 
 
 @hand("medium.window", "m")

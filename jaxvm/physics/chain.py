@@ -22,6 +22,12 @@ from jaxvm.physics.ports import PortValues
 WINDOW_INDEX = 1.52
 """Refractive index of the glass that `medium.window` puts before the lens (N-BK7, visible)."""
 
+DOME_RADII = 0.070, 0.074
+"""Inner and outer radius (m) of the dome of that glass of which `medium.dome` tells the middle."""
+
+_DOME_TURNS = 2
+"""Times that the ray inside the dome is aimed; what a third one changes can't be measured."""
+
 
 class Sight(NamedTuple):
     """The unknowns that one observation touches, gathered from the state; poses in either form."""
@@ -182,10 +188,8 @@ def refract(
     (MATHEMATICS 1.9). A plane-parallel plate of thickness d and index n, normal to the axis, brings
     the mark nearer by d (1 - cos i / sqrt(n^2 - sin^2 i)) along the axis and turns no ray. A plate
     whose far face is tilted by the wedge w turns rays by (sqrt(n^2 - sin^2 i) - cos i) w, in
-    direction cosines across the axis (Snell's law at the far face, to first order in w). A dome of
-    radii R and R + t about a point at c from the pupil turns a ray of direction e by
-    k (c - (c e) e), k = (1 - 1/n) (1/R - 1/(R + t)) (Snell's law at both faces, to first order
-    in c); the port is k c.
+    direction cosines across the axis (Snell's law at the far face, to first order in w). For a dome
+    see `_through_dome`.
     """
     square = mark_cam @ mark_cam
     across_axis = jnp.stack([ports["medium.bend_u"], ports["medium.bend_v"], jnp.zeros(())])
@@ -199,9 +203,46 @@ def refract(
     across = prism * jnp.stack([ports["medium.wedge_x"], ports["medium.wedge_y"]])
     # A direction keeps its length; nothing that is seen through a plane window is beside it.
     along = -(way[:2] @ across) / jnp.maximum(way[2], 0.05)
-    beside = ports.axes("medium.dome")
-    turned = beside - (beside @ way) * way
-    return straight + distance * (jnp.concatenate([across, along[None]]) + turned)
+    turned = _through_dome(straight, ports.axes("medium.dome"))
+    return turned + distance * jnp.concatenate([across, along[None]])
+
+
+def _through_dome(mark: Float[Array, "3"], middle: Float[Array, "3"]) -> Float[Array, "3"]:
+    """Apparent mark (m) through two spheres about a point that is beside the pupil (m).
+
+    Snell's law at a sphere keeps the ray's distance p from the middle: sin i = p / R without and
+    p / (n R) within the glass. Both faces together turn the ray about the middle by
+
+        asin(p / R) - asin(p / (n R)) - asin(p / R') + asin(p / (n R')),
+
+    which is all that they do. The apparent mark is the mark turned back by that angle, p being that
+    of the ray inside, which is aimed at it.
+    """
+    inner, _ = DOME_RADII
+    distance = jnp.linalg.norm(mark)
+    way = mark / distance
+    along = middle @ way
+    off = middle - along * way
+    # Without a dome there is no direction to it, and none is needed.
+    apart = jnp.sqrt(off @ off + 1e-24)
+    seen = jnp.stack([distance, jnp.zeros(())])
+    for _ in range(_DOME_TURNS):
+        p = (apart * seen[0] - along * seen[1]) / jnp.linalg.norm(seen)
+        p = jnp.clip(p, -0.9 * inner, 0.9 * inner)
+        by_face = [
+            jnp.arcsin(p / radius) - jnp.arcsin(p / (WINDOW_INDEX * radius))
+            for radius in DOME_RADII
+        ]
+        turn = by_face[0] - by_face[1]
+        sine, cosine = jnp.sin(turn), jnp.cos(turn)
+        from_middle = distance - along
+        seen = jnp.stack(
+            [
+                along + from_middle * cosine + apart * sine,
+                apart + from_middle * sine - apart * cosine,
+            ]
+        )
+    return seen[0] * way + seen[1] * off / apart
 
 
 # --- lens, sensor, detection --------------------------------------------------------------------

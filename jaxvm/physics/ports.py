@@ -109,8 +109,8 @@ PORTS: tuple[Port, ...] = (
     *_axes(
         "medium.dome",
         "medium",
-        "rad",
-        0.02,
+        "m",
+        0.03,
         "the middle of a dome lies off the pupil along the camera's {axis} axis",
     ),
     *_axes("station.turn", "station", "rad", 0.02, "the station turns about its own {axis} axis"),

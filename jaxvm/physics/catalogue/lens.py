@@ -211,7 +211,7 @@ LENS: tuple[Entry, ...] = (
     Entry(
         "window-off-centre", "a dome or a wedged window stands off the axis", (21,),
         _DOME, ALWAYS, ALWAYS, "camera",
-        (1e-6, 1e-2), "decentring of the lens", "take the window away, or turn it",
+        (1e-5, 3e-2), "decentring of the lens", "take the window away, or turn it",
         "The camera does not sit in the middle of its dome, or its window is a wedge. The image is "
         "bent to one side, like that of a lens whose elements do not share one axis.",
     ),
