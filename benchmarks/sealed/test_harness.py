@@ -15,8 +15,17 @@ from world import EFFECTS, heat, record
 from world.effect import Site
 
 from jaxvm.discover.cells import arrange
+from jaxvm.discover.courses import Course
+from jaxvm.discover.curved import with_curved
+from jaxvm.discover.groups import Group
+from jaxvm.discover.hypotheses import Hypothesis
+from jaxvm.discover.score import ScoreTests
+from jaxvm.discover.select import refit
+from jaxvm.discover.space import enumerate_hypotheses
+from jaxvm.physics.effects import Scope, Term
 from jaxvm.recording import join, read_recording
 from jaxvm.simulate import simulate_deformation_scene
+from jaxvm.solve.snooping import robust_variance
 
 
 @pytest.fixture(scope="module")
@@ -313,3 +322,35 @@ def test_a_second_camera_shares_the_target_and_not_the_lens(kind, tmp_path):
     both = join(*(read_recording(tmp_path / name) for name in ("first", "second")))
     assert [camera.name for camera in both.model.cameras] == ["camera", "second"]
     assert "pose" in both.model.cameras[1].free
+
+
+def test_a_dome_is_measured_though_its_tangent_hides_it(tmp_path):
+    """The lens, the middle of the image and the board's poses take up pixels of it.
+
+    What is left is of the second order: the scores see a small part, a fit sees all of it.
+    """
+    made = record("wide", 662945752, ("dome-off-centre",))
+    (hidden,) = made.truth["hidden"]
+    made.write(tmp_path / "dome")
+    base, parts = plain_fit(read_recording(tmp_path / "dome"))
+    tests = ScoreTests.of(base, enumerate_hypotheses(base.scene))
+    ranking = tests.score(robust_variance(base))
+    always = Course("constant", "constant")
+    place = Scope(camera=("camera",))
+    skew = Hypothesis(Group((Term("sensor.skew"),), "camera"), always, place, ())
+    (dome, *_), _ = with_curved([(skew, 1.0, np.zeros(1))], ranking, base.scene)
+    found = refit(base, dome, np.zeros(3), parts)
+    drop = 2.0 * (base.cost - found.adjustment.cost)
+    foretold = max(
+        float(scores.drop[g].max())
+        for scores in ranking.scores
+        for g, group in enumerate(scores.family.groups)
+        if group.terms == dome.group.terms
+    )
+    print(foretold, drop)
+    assert foretold < 0.2 * drop
+    assert found.adjustment.variance_factor < base.variance_factor
+    # Half of the offset is along the axis, in the simulated dome of another radius and glass.
+    across, along = np.linalg.norm(found.amplitudes[:2]), found.amplitudes[2]
+    assert along == pytest.approx(0.5 * across, rel=0.3)
+    assert across == pytest.approx(abs(hidden["size"]), rel=0.5)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from jaxvm.discover.accept import Accepted, accept, alternatives, as_good, short
+from jaxvm.discover.curved import with_curved
 from jaxvm.discover.detail import with_detail
 from jaxvm.discover.diagnosis import Finding
 from jaxvm.discover.doubt import doubted
@@ -114,6 +115,7 @@ class Search:
                 leading, self._tests, self.ranking, self._weigh
             )
             leading = with_slow_beginnings(leading, self.ranking, self.current.scene)
+            leading = with_curved(leading, self.ranking, self.current.scene)
             if self.p_value <= self.alpha:
                 leading = with_jumps(leading, self._tests, self.ranking, self._weigh)
             accepted = self._accepted(leading, progress)
