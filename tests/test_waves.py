@@ -251,6 +251,23 @@ def test_shimmering_air_is_named_and_measured(pair):
     assert "signal.png" in pictures and "the air shimmers" in html(found, pictures)
 
 
+def test_what_neighbours_share_a_little_is_haze_where_it_falls_off(pair):
+    """Less than a seventh of the variance; images that shift as a whole have noise in common."""
+    known = replace(pair.model, targets=(replace(pair.model.targets[0], free=()),))
+    change = turbulent(pair, 0.018, 250.0, 0.0, 12)
+    found = diagnose(replace(recorded(pair, change), model=known))
+    assert 0.0 < found.likeness < ALIKE
+    assert found.signal is not None and not found.signal.whole
+    assert np.abs(found.signal.size_rad - 0.018 / 1100.0).max() < 4.0 * (
+        found.signal.size_stds_rad.max()
+    )
+    obs = pair.observations
+    jumps = 0.018 * np.random.default_rng(13).standard_normal((2, N_EPOCHS, 2))
+    found = diagnose(replace(recorded(pair, jumps[obs.camera, obs.epoch]), model=known))
+    assert 0.0 < found.likeness < ALIKE
+    assert found.signal is None and not found.findings
+
+
 def test_what_lasts_is_no_haze(pair):
     """A field that goes on from image to image is a deformation."""
     known = replace(pair.model, targets=(replace(pair.model.targets[0], free=()),))

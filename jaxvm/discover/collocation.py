@@ -30,8 +30,8 @@ _NEAREST = 16
 
 _RATIOS = np.geomspace(0.03, 1000.0, 19)
 _LENGTHS = 8
-_SURE = 3.0
-"""Standard deviations by which the signal of a camera must differ from none."""
+_SURE, _ALSO = 3.0, 2.0
+"""Standard deviations by which the signal of one camera must differ from none, and of others."""
 
 _WHOLE, _CLEARLY = 1e9, 2.0
 """Length (px) of what moves images as a whole; standard deviations by which it must be worse."""
@@ -85,10 +85,11 @@ class Signal:
 def collocate(fitted: Adjustment, heldout: HeldOut, parts: Split, seed: int = 0) -> Signal | None:
     """The signal that neighbouring marks share at random, if held-out epochs prove it.
 
-    None where neighbours are hardly alike; where what they share lasts from one epoch to the next,
-    which a deformation does that is not modelled; and where fewer than two cameras show it: what
-    one has for itself is no signal of the air, and has an amount for every image. It falls off with
-    distance where that foretells clearly better than images that move as a whole.
+    None where neighbours are alike by chance; where what they share lasts from one epoch to the
+    next, which a deformation does that is not modelled; and where fewer than two cameras show it:
+    what one has for itself is no signal of the air, and has an amount for every image. It falls off
+    with distance where that foretells clearly better than images that move as a whole; those that
+    do so a little (`ALIKE`) have noise in common.
 
     Args:
         fitted: the last fit, to the fitted epochs.
@@ -99,7 +100,8 @@ def collocate(fitted: Adjustment, heldout: HeldOut, parts: Split, seed: int = 0)
     scene = fitted.scene
     n_cameras = len(scene.model.cameras)
     whitened = parts.residuals(fitted)
-    if n_cameras < 2 or likeness(scene, whitened) <= ALIKE:
+    alike = likeness(scene, whitened)
+    if n_cameras < 2 or not alike:
         return None
     marks = _Marks.of(scene, whitened)
     common, length = _covariance(marks, _lengths(marks))
@@ -107,10 +109,13 @@ def collocate(fitted: Adjustment, heldout: HeldOut, parts: Split, seed: int = 0)
     whole, far = _covariance(marks, np.array([_WHOLE]))
     as_a_whole = _Shown.of(marks, np.full(n_cameras, whole), far)
     if not shown.better(as_a_whole, scene):
+        if alike <= ALIKE:
+            return None
         shown, length = as_a_whole, far
     variances, stds = shown.variances(scene)
-    cameras = tuple(np.flatnonzero(variances > _SURE * stds).tolist())
-    if len(cameras) < 2 or abs(shown.lasting(scene, cameras)) > LASTING:
+    cameras = tuple(np.flatnonzero(variances > _ALSO * stds).tolist())
+    sure = (variances > _SURE * stds).any()
+    if not sure or len(cameras) < 2 or abs(shown.lasting(scene, cameras)) > LASTING:
         return None
     squares = np.array([np.mean(marks.error[marks.camera == c] ** 2) for c in cameras])
     signal = np.minimum(variances[[*cameras]], _MOST * squares)
