@@ -19,6 +19,7 @@ from jaxvm.discover.second_camera import (
     of_first_cameras,
     with_second_camera,
 )
+from jaxvm.discover.sights import across, marks_in_camera, middle_of_cameras, unit
 from jaxvm.geometry.lenses import lens_family
 from jaxvm.network.residual import predict_pixels
 from jaxvm.network.scene import Scene, build
@@ -81,29 +82,13 @@ def _turned(angles: Callable[[int], np.ndarray], axis: str):
             before = Rotation.from_rotvec(poses[target, :, :3])
             middle = before.apply(middles[target]) + poses[target, :, 3:]
             sight = middle - eye
-            about = _unit(sight) if axis == "sight" else _across(sight, up)[1]
+            about = unit(sight) if axis == "sight" else across(sight, up)[1]
             turned = Rotation.from_rotvec(angles(len(sight))[:, None] * about) * before
             moved[target, :, :3] = turned.as_rotvec()
             moved[target, :, 3:] = middle - turned.apply(middles[target])
         return moved
 
     return change
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-
-
-def _across(sight: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors to the side of lines of sight and upward across them.
-
-    For a sight along `up` any side will do.
-    """
-    steep = np.abs(_unit(sight) @ up) > 0.99
-    other = np.roll(up, 1) if abs(up @ np.roll(up, 1)) < 0.9 else np.array([1.0, 0.0, 0.0])
-    reference = np.where(steep[:, None], other, up)
-    side = _unit(np.cross(sight, reference))
-    return side, _unit(np.cross(side, sight))
 
 
 def _swept(poses, middles, eye, up):
@@ -113,10 +98,8 @@ def _swept(poses, middles, eye, up):
     phase = 2.0 * np.pi * np.arange(n) / n
     for target in range(len(poses)):
         sight = poses[target, :, 3:] - eye
-        across, upward = _across(sight, up)
-        about = 0.35 * (
-            np.sin(3.0 * phase)[:, None] * upward + np.sin(2.0 * phase)[:, None] * across
-        )
+        side, upward = across(sight, up)
+        about = 0.35 * (np.sin(3.0 * phase)[:, None] * upward + np.sin(2.0 * phase)[:, None] * side)
         moved[target, :, 3:] = eye + Rotation.from_rotvec(about).apply(sight)
     return moved
 
@@ -295,18 +278,6 @@ def _on_another_day(scene: Scene) -> Scene:
     return replace(scene, network=network)
 
 
-def _eye(scene: Scene) -> np.ndarray:
-    """The middle of all cameras in the world (m), at the first epoch."""
-    names = [s.name for s in scene.model.stations]
-    places = []
-    for i, camera in enumerate(scene.model.cameras):
-        row = scene.station_row[names.index(camera.station), 0]
-        carrier = np.array(scene.state.world_from_station[row])
-        mounted = np.array(scene.state.station_from_camera[i])
-        places.append(Rotation.from_rotvec(carrier[:3]).apply(mounted[3:]) + carrier[3:])
-    return np.mean(places, axis=0)
-
-
 def _with_poses(plan: Plan, scene: Scene):
     assert plan.poses is not None
     table = np.array(scene.state.carrier_from_target)
@@ -316,7 +287,7 @@ def _with_poses(plan: Plan, scene: Scene):
     up = np.asarray(scene.model.up, float)
     middles = [scene.model.targets[i].points for i in moving]
     middles = np.array([0.5 * (p.min(axis=0) + p.max(axis=0)) for p in middles])
-    table[rows] = plan.poses(table[rows], middles, _eye(scene), up)
+    table[rows] = plan.poses(table[rows], middles, middle_of_cameras(scene), up)
     return eqx.tree_at(lambda s: s.carrier_from_target, scene.state, jnp.asarray(table))
 
 
@@ -326,7 +297,7 @@ def _nearest(scene: Scene) -> float:
     A tilted board whose middle is at half the distance would reach through the camera, and there
     everything tells itself from everything.
     """
-    depths = [_in_camera(scene, rows)[:, 2] for rows in scene.tables]
+    depths = [marks_in_camera(scene, rows)[:, 2] for rows in scene.tables]
     seen = [depth[depth > 0.0] for depth in depths if (depth > 0.0).any()]
     return _NEAREST * float(min(map(np.min, seen), default=0.0))
 
@@ -344,31 +315,11 @@ def _seen(scene: Scene, rows: np.ndarray, pixels: np.ndarray, nearest: float) ->
     cameras, state = scene.model.cameras, scene.state
     sizes = np.array([c.image_size for c in cameras], float)[camera]
     inside: Any = np.all((pixels > 0.0) & (pixels < sizes - 1.0), axis=1)
-    marks = _in_camera(scene, rows)
+    marks = marks_in_camera(scene, rows)
     focal, centre, distortion = (
         np.asarray(v)[camera] for v in (state.focal, state.centre, state.distortion)
     )
     where = np.where(inside[:, None], pixels, 0.0)
     back = rays_of_pixels(lens_family(cameras[camera[0]].lens), focal, centre, distortion, where)
-    cosine = np.sum(_unit(back) * _unit(marks), axis=1)
+    cosine = np.sum(unit(back) * unit(marks), axis=1)
     return inside & (marks[:, 2] > nearest) & (cosine > np.cos(_SAME_RAY_RAD))
-
-
-def _in_camera(scene: Scene, rows: np.ndarray) -> np.ndarray:
-    """Marks of observations in camera coordinates (m)."""
-    obs, state = scene.recording.observations, scene.state
-    names = [s.name for s in scene.model.stations]
-    station = np.array([names.index(c.station) for c in scene.model.cameras])
-    camera, epoch, target = obs.camera[rows], obs.epoch[rows], obs.target[rows]
-    point = np.asarray(state.point)[scene.first_point[target] + obs.point[rows]]
-    for pose, outward in (
-        (scene.world_from_targets(target, epoch), True),
-        (np.array(state.world_from_station)[scene.station_row[station[camera], epoch]], False),
-        (np.array(state.station_from_camera)[camera], False),
-    ):
-        turn = Rotation.from_rotvec(pose[:, :3])
-        if outward:
-            point = turn.apply(point) + pose[:, 3:]
-        else:
-            point = turn.inv().apply(point - pose[:, 3:])
-    return point

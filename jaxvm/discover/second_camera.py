@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
+from jaxvm.discover.sights import across, marks_in_world, world_from_cameras
 from jaxvm.network.scene import Scene, build
 from jaxvm.physics.effects import Effect
 from jaxvm.physics.ports import PORT_INDEX, PORTS
@@ -97,24 +98,14 @@ def _aside(scene: Scene) -> tuple[Float[np.ndarray, "6"], Bool[np.ndarray, " obs
 
     On the side from which more of them are seen.
     """
-    obs, state = scene.recording.observations, scene.state
-    world_from_target = scene.world_from_targets(obs.target, obs.epoch)
-    turn = Rotation.from_rotvec(world_from_target[:, :3])
-    local = np.asarray(state.point)[scene.first_point[obs.target] + obs.point]
-    mark = turn.apply(local) + world_from_target[:, 3:]
+    obs = scene.recording.observations
+    mark = marks_in_world(scene, np.arange(len(obs.epoch)))
+    turn = Rotation.from_rotvec(scene.world_from_targets(obs.target, obs.epoch)[:, :3])
     normal = turn.apply([0.0, 0.0, 1.0])
-    station = np.array(state.world_from_station)[scene.station_row[_station(scene), 0]]
-    mounted = np.array(state.station_from_camera)[0]
-    carried = Rotation.from_rotvec(station[:3])
-    attitude = carried * Rotation.from_rotvec(mounted[:3])
-    eye = carried.apply(mounted[3:]) + station[3:]
+    attitudes, places = world_from_cameras(scene)
+    attitude, eye = attitudes[0], places[0]
     middle = np.median(mark, axis=0)
-    sight = (middle - eye) / np.linalg.norm(middle - eye)
-    up = np.asarray(scene.model.up, float)
-    # To the side of a sight along `up` is where the image's sides are.
-    upward = up if abs(up @ sight) < 0.9 else attitude.as_matrix()[:, 1]
-    axis = upward - (upward @ sight) * sight
-    axis /= np.linalg.norm(axis)
+    _, (axis,) = across((middle - eye)[None], np.asarray(scene.model.up, float))
 
     def cosines(place):
         way = mark - place
@@ -128,10 +119,6 @@ def _aside(scene: Scene) -> tuple[Float[np.ndarray, "6"], Bool[np.ndarray, " obs
         pose = np.concatenate([(about * attitude).as_rotvec(), place])
         found.append((pose, front * cosines(place) > _MOST_OBLIQUE))
     return max(found, key=lambda one: int(one[1].sum()))
-
-
-def _station(scene: Scene) -> int:
-    return scene.station_places[scene.model.cameras[0].station]
 
 
 def of_first_cameras(effects: Sequence[Effect], first: Model, model: Model) -> tuple[Effect, ...]:
