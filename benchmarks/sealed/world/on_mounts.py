@@ -171,8 +171,10 @@ def _(site):
 
 @effect("neighbour-warms-mount", (37,), "svr", "body")
 def _(site):
-    """Follows another camera's housing."""
-    others = [k for k in range(len(site.scene.cameras)) if k not in site.cameras]
+    """Follows the housing of another camera on its station."""
+    cameras = site.scene.cameras
+    near = {cameras[k].station for k in site.cameras}
+    others = [k for k, c in enumerate(cameras) if c.station in near and k not in site.cameras]
     other = int(site.rng.choice(others))
     course = courses.follow(site, "housing", other)
     return _turn(site, course, 2e-7, 3e-5)

@@ -152,7 +152,7 @@ def _(site):
     return site.draft(hooks, 1e-5, 1e-2, course, {})
 
 
-def _clock(site, late, low, high, course, ports=None):
+def _clock(site, late, low, high, course, ports=None, fixed=False):
     """Exposures of the cameras are late by size x late(view) (s)."""
 
     def hooks(size):
@@ -162,7 +162,7 @@ def _clock(site, late, low, high, course, ports=None):
 
         return {"clock": hook}
 
-    return site.draft(hooks, low, high, course, ports)
+    return site.draft(hooks, low, high, course, ports, fixed=fixed)
 
 
 def _rows(view):
@@ -193,9 +193,10 @@ def _(site):
 
 @effect("frame-slip", (60,), "v", "body")
 def _(site):
-    """From an instant on one camera delivers the frame before."""
+    """From an instant on one camera delivers the frame before: late by a period of its rate."""
     course = courses.step(site)
-    return _clock(site, course.at, 1.0 / 200.0, 1.0 / 20.0, course, CLOCKS)
+    period = 1.0 / float(site.rng.choice([60.0, 75.0, 100.0, 120.0, 200.0]))
+    return _clock(site, course.at, period, period, course, CLOCKS, fixed=True)
 
 
 @effect("clocks-drift", (61,), "v", "body")
