@@ -1,12 +1,12 @@
-"""Execute every notebook here in place: all cells from a fresh kernel; an error stops the run.
+"""Execute every notebook here, two at a time, from a fresh kernel; an error stops the run.
 
-`python notebooks/execute.py --keep` writes the outputs into the notebooks; without it they are only
-checked. Two run at a time.
+Without --keep they are only checked.
 """
 
-import sys
+import argparse
 import time
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import nbformat
@@ -15,7 +15,7 @@ from nbclient import NotebookClient
 FOLDER = Path(__file__).parent
 
 
-def execute(path: Path) -> str:
+def execute(path: Path, keep: bool) -> str:
     """Execute one notebook; its name and seconds."""
     began = time.perf_counter()
     notebook = nbformat.read(path, as_version=4)
@@ -23,7 +23,7 @@ def execute(path: Path) -> str:
         notebook, timeout=1800, kernel_name="python3", resources={"metadata": {"path": FOLDER}}
     )
     client.execute()
-    if "--keep" in sys.argv:
+    if keep:
         for cell in notebook.cells:
             cell.metadata.pop("execution", None)
         nbformat.write(notebook, path)
@@ -31,8 +31,12 @@ def execute(path: Path) -> str:
 
 
 def main() -> None:
+    """Read the command line and execute them."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--keep", action="store_true", help="write the outputs into the notebooks")
+    keep = parser.parse_args().keep
     with ProcessPoolExecutor(2) as pool:
-        for line in pool.map(execute, sorted(FOLDER.glob("*.ipynb"))):
+        for line in pool.map(partial(execute, keep=keep), sorted(FOLDER.glob("*.ipynb"))):
             print(line, flush=True)
 
 
