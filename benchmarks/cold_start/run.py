@@ -5,6 +5,7 @@ programs, then five times with it (the median counts), and between them five tim
 cache alone, where every process traces and lowers its programs anew.
 """
 
+import argparse
 import json
 import os
 import statistics
@@ -40,6 +41,7 @@ def seconds(way: str, work: str) -> float:
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
     with tempfile.TemporaryDirectory() as work:
         runs = {way: [seconds(way, work)] for way in WAYS}
         for _ in range(REPETITIONS):

@@ -5,6 +5,7 @@ with it filled. Peak memory is that of the process (maximum resident set). The f
 shown one by one: how far few coefficients come.
 """
 
+import argparse
 import json
 import os
 import subprocess
@@ -91,6 +92,7 @@ def table(found: dict) -> str:
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
     with tempfile.TemporaryDirectory() as work:
         cache, out = f"{work}/compiled", f"{work}/report"
         runs = [timed(cache, out) for _ in range(2)]

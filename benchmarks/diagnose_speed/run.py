@@ -5,6 +5,7 @@ and moving targets), each with one hidden effect or none. Each is diagnosed in o
 diagnosed it once before; the second time counts. results.json and results.md are written here.
 """
 
+import argparse
 import json
 import os
 import statistics
@@ -55,6 +56,7 @@ def table(results: dict) -> str:
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
     rows = []
     with tempfile.TemporaryDirectory() as work:
         for number, hidden in enumerate(HIDDEN):

@@ -6,6 +6,7 @@ place; with which size, in standard deviations; and the held-out improvement. Th
 those of the tests. `python benchmarks/hidden_physics/run.py [SEEDS] [EMPTY]`.
 """
 
+import argparse
 import sys
 import tempfile
 import time
@@ -101,6 +102,7 @@ def table(results: dict) -> str:
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
     n_seeds = int(sys.argv[1]) if len(sys.argv) > 1 else 3
     n_empty = int(sys.argv[2]) if len(sys.argv) > 2 else 20
     rows = []

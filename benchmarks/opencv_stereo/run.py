@@ -10,6 +10,7 @@ the pose of the board is fitted in a held-out pair.
 results.json and results.md are written here.
 """
 
+import argparse
 import sys
 import tempfile
 from pathlib import Path
@@ -152,6 +153,7 @@ def table(results: dict) -> str:
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
     data = find_data("opencv-stereo")
     if data is None:
         print("opencv-stereo is not here; set JAXVM_DATA to the folder that has it")

@@ -7,6 +7,7 @@ poses without a start. PoseLib is left out where it is not installed.
     python benchmarks/pose/run.py
 """
 
+import argparse
 import os
 import sys
 import time
@@ -254,6 +255,7 @@ def table(results: dict) -> str:
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
     rng = np.random.default_rng(0)
     results = {
         "speed": speed(rng)["rows"],
