@@ -40,6 +40,13 @@ def test_a_camera_that_errs_always_may_stand_behind_a_dome(board):
     np.testing.assert_array_equal(amplitudes, np.zeros(3))
 
 
+def test_where_an_error_that_never_changes_was_found_no_dome_is_tried(board):
+    plain, ranking = board
+    leading = [(SKEW, 50.0, np.zeros(1))]
+    assert with_curved(leading, ranking, plain.scene, [SKEW]) == leading
+    assert len(with_curved(leading, ranking, plain.scene, [CREEP])) == 2
+
+
 def test_what_changes_or_is_tried_already_brings_no_dome(board):
     plain, ranking = board
     moving = [(CREEP, 50.0, np.zeros(1))]

@@ -5,9 +5,12 @@ distortion take up nearly all of that. What they leave is of the second order in
 offset its derivative is next to nothing, while a fit finds it from there at once.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from jaxvm.discover.finer import Leading
+from jaxvm.discover.hypotheses import Hypothesis
 from jaxvm.discover.ranking import Ranking
 from jaxvm.discover.space import member
 from jaxvm.network.scene import Scene
@@ -20,15 +23,21 @@ _FOREMOST = 4
 """Leading hypotheses of which one must say that a camera errs always."""
 
 
-def with_curved(leading: Leading, ranking: Ranking, scene: Scene) -> Leading:
+def with_curved(
+    leading: Leading, ranking: Ranking, scene: Scene, known: Sequence[Hypothesis] = ()
+) -> Leading:
     """The leading ones, and before one that says that a camera errs always what may be behind it.
 
-    It counts as foretold as well as that one, whose name it may turn out to be.
+    It counts as foretold as well as that one, whose name it may turn out to be. Where something
+    that never changes was found at the camera (`known`) it had its turn: beside a window and a map
+    of the image a dome takes any place, and fits creep.
     """
+    seen = {other.scope for other in known if other.course.form == "constant"}
     for k, (hypothesis, foretold, _) in enumerate(leading[:_FOREMOST]):
-        if hypothesis.course.form != "constant" or not hypothesis.scope.camera:
+        scope = hypothesis.scope
+        if hypothesis.course.form != "constant" or not scope.camera or scope in seen:
             continue
-        for found, amplitudes in _at(ranking, hypothesis.scope, scene):
+        for found, amplitudes in _at(ranking, scope, scene):
             if not any(h.same(found) for h, *_ in leading):
                 return [*leading[:k], (found, foretold, amplitudes), *leading[k:]]
     return leading

@@ -115,7 +115,8 @@ class Search:
                 leading, self._tests, self.ranking, self._weigh
             )
             leading = with_slow_beginnings(leading, self.ranking, self.current.scene)
-            leading = with_curved(leading, self.ranking, self.current.scene)
+            known = [finding.hypothesis for finding in self.findings]
+            leading = with_curved(leading, self.ranking, self.current.scene, known)
             if self.p_value <= self.alpha:
                 leading = with_jumps(leading, self._tests, self.ranking, self._weigh)
             accepted = self._accepted(leading, progress)
