@@ -347,7 +347,6 @@ def test_a_dome_is_measured_though_its_tangent_hides_it(tmp_path):
         for g, group in enumerate(scores.family.groups)
         if group.terms == dome.group.terms
     )
-    print(foretold, drop)
     assert foretold < 0.2 * drop
     assert found.adjustment.variance_factor < base.variance_factor
     # Half of the offset is along the axis, in the simulated dome of another radius and glass.
