@@ -26,36 +26,30 @@ def questions() -> list[tuple[str, str, str]]:
 def section(name: str, question: str, command: str) -> list[str]:
     """A folder's tables, one level down, and its figures."""
     lines = [f"## {name}", "", question, "", f"Command: {command}", ""]
-    tables = sorted((HERE / name).glob("results*.md"), key=lambda table: (_age(table), table.stem))
-    # Of the sealed sets the last one.
-    for table in tables[-1:] if name == "sealed" else tables:
+    folder = _newest_seed() if name == "sealed" else HERE / name
+    tables = sorted(folder.glob("results*.md"), key=lambda table: table.stem)
+    for table in tables:
         text = table.read_text().rstrip()
         # Long lists (every case of a benchmark) stay in the folder.
         head = re.split(r"^## (?:By hidden effect|What went wrong)", text, flags=re.M)[0].rstrip()
         if len(head) < len(text):
-            head += f"\n\n(Case by case: `{name}/{table.name}`.)"
+            head += f"\n\n(Case by case: `{table.relative_to(HERE)}`.)"
         lines += [re.sub(r"^(#+) ", r"##\1 ", head, flags=re.M), ""]
     if not tables:
         files = sorted(path.name for path in (HERE / name).glob("*.json"))
         lines += [f"Numbers: {', '.join(f'`{name}/{file}`' for file in files)}.", ""]
     missed = HERE / name / "missed.md"
     lines += [f"#{missed.read_text().rstrip()}", ""] if missed.exists() else []
-    newest = [path for path in sorted((HERE / name).glob("*.png")) if _shown(name, path, tables)]
-    lines += [f"![{path.stem}]({name}/{path.name})" for path in newest]
-    return [*lines, ""] if newest else lines
+    figures = sorted(folder.glob("*.png"))
+    lines += [f"![{path.stem}]({path.relative_to(HERE)})" for path in figures]
+    return [*lines, ""] if figures else lines
 
 
-def _age(table: Path) -> int:
-    """Sealed sets in the order of their hashes."""
-    seed = table.stem.removeprefix("results-")
-    return (HERE / "sealed" / "hashes.md").read_text().find(f"| {seed} |")
-
-
-def _shown(name: str, figure: Path, tables: list[Path]) -> bool:
-    """Of the sealed sets those of the last one."""
-    if name != "sealed" or not tables:
-        return True
-    return figure.name.startswith(tables[-1].stem.removeprefix("results-"))
+def _newest_seed() -> Path:
+    """The sealed set whose hash was published last, among those that are opened."""
+    published = (HERE / "sealed" / "hashes.md").read_text()
+    opened = (table.parent for table in (HERE / "sealed" / "seeds").glob("*/results.md"))
+    return max(opened, key=lambda folder: published.find(f"| {folder.name} |"))
 
 
 def page() -> str:

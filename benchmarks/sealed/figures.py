@@ -1,7 +1,8 @@
 """Draw a scored sealed benchmark.
 
 `python benchmarks/sealed/figures.py DIR [DIR ...] [--label NAME]` reads DIR/results.json and saves
-detection.png, confusion.png, sets.png, calibration.png and heldout.png, each as NAME-*.png.
+detection.png, confusion.png, sets.png, calibration.png and heldout.png in
+benchmarks/sealed/seeds/NAME.
 """
 
 import argparse
@@ -14,7 +15,7 @@ from judge import SHOWN, Z_90
 from matplotlib.figure import Figure
 from tally import FLOOR_RATIO, wilson
 
-HERE = Path(__file__).parent
+SEEDS = Path(__file__).parent / "seeds"
 GOOD, BAD, INK = "#0f766e", "#c2410c", "#334155"
 MOST_NAMES = 80
 
@@ -139,12 +140,14 @@ def held_out(rows: list[dict]) -> Figure:
 def main() -> None:
     parser = argparse.ArgumentParser(description="draw a scored sealed benchmark")
     parser.add_argument("folders", type=Path, nargs="+", metavar="DIR")
-    parser.add_argument("--label", default=None, help="first part of the files' names")
+    parser.add_argument("--label", default=None, help="of the folder; those of DIR if not set")
     options = parser.parse_args()
     rows = []
     for folder in options.folders:
         rows += json.loads((folder / "results.json").read_text())["rows"]
     label = options.label or "-".join(folder.resolve().name for folder in options.folders)
+    folder = SEEDS / label
+    folder.mkdir(parents=True, exist_ok=True)
     drawn = {
         "detection": detection,
         "confusion": confusion,
@@ -153,7 +156,7 @@ def main() -> None:
         "heldout": held_out,
     }
     for name, draw in drawn.items():
-        file = HERE / f"{label}-{name}.png"
+        file = folder / f"{name}.png"
         draw(rows).savefig(file, dpi=120)
         print(f"written {file}")
 

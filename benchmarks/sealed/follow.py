@@ -7,7 +7,7 @@ world makes the same scene again under the plan that was named best, `jaxvm diag
 SECOND` sees the two and nothing else, and the key tells whether the doubles came apart: the right
 name in a set that has no longer both names of any pair that the plan promised to part. Stricter are
 *first*: it leads there, too; and *alone*: no other name at all is left. Writes DIR/follow.json and
-benchmarks/sealed/follow-NAME.md.
+benchmarks/sealed/seeds/NAME/follow.md.
 """
 
 import argparse
@@ -25,7 +25,7 @@ from score import sealed_key
 from solve import copy_recording, environment
 from world import record
 
-HERE = Path(__file__).parent
+SEEDS = Path(__file__).parent / "seeds"
 
 
 def asked(folder: Path, entries: list[dict]) -> list[dict]:
@@ -167,7 +167,9 @@ def main() -> None:
             print(f"{words}  ({case['chance']:.0%}): {state}", flush=True)
     label = options.label or folder.name
     text = markdown(label, results)
-    (HERE / f"follow-{label}.md").write_text(text, encoding="utf-8")
+    table = SEEDS / label / "follow.md"
+    table.parent.mkdir(parents=True, exist_ok=True)
+    table.write_text(text, encoding="utf-8")
     print(text.splitlines()[2])
     (folder / "follow.json").write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
 

@@ -4,7 +4,7 @@
 
 Checks that the key is the one that was sealed, computes for every recording what it could show
 (kept in DIR/score-cache), judges every report, and writes DIR/results.json and
-benchmarks/sealed/results-NAME.md.
+benchmarks/sealed/seeds/NAME/results.md.
 """
 
 import argparse
@@ -19,6 +19,7 @@ from judge import judge
 from tally import by_effect, figures, markdown
 
 HERE = Path(__file__).parent
+SEEDS = HERE / "seeds"
 
 
 def sealed_key(folder: Path) -> tuple[list[dict], str]:
@@ -165,9 +166,11 @@ def main() -> None:
     label = options.label or "-".join(folder.resolve().name for folder in options.folders)
     part = "" if len(rows) == made else f" ({len(rows)} of {made} recordings)"
     page = markdown(rows, f"Sealed benchmark {label}{part}", digests)
-    (HERE / f"results-{label}.md").write_text(page, encoding="utf-8")
+    table = SEEDS / label / "results.md"
+    table.parent.mkdir(parents=True, exist_ok=True)
+    table.write_text(page, encoding="utf-8")
     print(page.split("## What went wrong")[0])
-    print(f"written {HERE / f'results-{label}.md'}")
+    print(f"written {table}")
 
 
 if __name__ == "__main__":
