@@ -285,6 +285,23 @@ def test_time_is_asked_of_marks_but_not_too_often():
     assert hypothesis.scope == Scope(target=("reference",), point=("0/3",))
 
 
+def test_what_never_changes_has_half_of_the_prior_of_its_name():
+    """A scale that is wrong is as likely as one that follows any quantity, not one in twenty."""
+    scene = logged_scene()
+    shares = []
+    for family in enumerate_hypotheses(scene):
+        for g, c, s in np.argwhere(family.valid):
+            if family.groups[g].terms[0].port == "range.scale" and len(family.groups[g].terms) == 1:
+                hypothesis = member(family, (int(g), int(c), int(s)), scene)
+                if "range-scale" in {entry.id for entry in hypothesis.entries}:
+                    kind = hypothesis.course.driver, hypothesis.course.form
+                    shares.append((kind, 1.0 / hypothesis.alternatives["range-scale"]))
+    by_kind = dict(shares)
+    assert by_kind.pop(("constant", "constant")) == 0.5
+    # Some quantities have a name of their own for what they do to ranges.
+    assert len(by_kind) > 10 and 0.25 < sum(by_kind.values()) <= 0.5
+
+
 def test_what_a_recording_lacks_is_not_asked():
     with_finder, without = (
         enumerate_hypotheses(build(stereo_recording(with_ranges=has).recording))

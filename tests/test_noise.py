@@ -10,12 +10,20 @@ from networks import HELD, adjusted, at_values, board_recording, photographs, st
 from scipy.linalg import eigh
 
 from jaxvm.discover.cells import local_rows
-from jaxvm.discover.noise import _BY_EPOCH, Correlation, _expected, _remembered, met
+from jaxvm.discover.noise import (
+    _BY_EPOCH,
+    Correlation,
+    _expected,
+    _remembered,
+    levels,
+    met,
+)
 from jaxvm.network.residual import residual
 from jaxvm.network.scene import build
 from jaxvm.physics.effects import Effect, Scope, Term
-from jaxvm.solve.adjust import adjust
+from jaxvm.solve.adjust import adjust, n_used
 from jaxvm.solve.covariance import influence, standard_deviations
+from jaxvm.solve.snooping import robust_variance
 
 APART = np.abs(np.subtract.outer(np.arange(N_EPOCHS), np.arange(N_EPOCHS)))
 
@@ -25,7 +33,7 @@ def scene():
     return long_board()
 
 
-def board(free: frozenset[str], places: int):
+def board(free: frozenset[str], places: int, seed: int = 0):
     """The board in 200 epochs, in so many places in turn, adjusted."""
     known = board_recording(free=frozenset({"focal"}))
     poses = known.truth["carrier_from_target"][:places]
@@ -33,7 +41,7 @@ def board(free: frozenset[str], places: int):
     target = replace(known.recording.model.targets[0], free=free, **motion)
     model = replace(known.recording.model, targets=(target,), priors=())
     every = poses[np.arange(N_EPOCHS) % places]
-    rng, held = np.random.default_rng(0), [HELD] * N_EPOCHS
+    rng, held = np.random.default_rng(seed), [HELD] * N_EPOCHS
     seen = photographs(model, N_EPOCHS, [held], [every], [target.points], rng, 1.0)
     number = np.arange(N_EPOCHS)
     recording = replace(
@@ -97,6 +105,14 @@ def test_white_noise_is_white(still, moving):
         found = [shown(fitted, seed) for seed in range(40)]
         # 1 % each for marks and images.
         assert sum(c == Correlation(0.0, 0.0, 0.0, 0.0) for c in found) >= 36
+
+
+def test_noise_is_more_than_the_residuals_that_unknowns_leave():
+    """The pose of every epoch follows a tenth of the noise: the robust variance is that of all."""
+    fits = [board(frozenset({"pose"}), 8, seed) for seed in range(6)]
+    assert fits[0].degrees_of_freedom < 0.91 * n_used(fits[0].problem)
+    # One such variance is known to a fiftieth.
+    assert np.mean([robust_variance(fit) for fit in fits]) == pytest.approx(1.0, abs=0.03)
 
 
 def test_shares_and_memories_are_recovered(still, moving):
@@ -202,6 +218,33 @@ def test_what_noise_does_to_an_effect_is_dense(bent):
     assert one.inflation == pytest.approx(np.sum(eigenvalues**2) / eigenvalues.sum())
     (white_one,) = met(bent, Correlation())
     assert (white_one.inflation, white_one.freedom) == (1.0, 2) and np.all(white_one.ratio == 1.0)
+
+
+def test_a_camera_that_is_noisier_counts_at_its_own_level(bent):
+    scene = bent.scene
+    camera = scene.recording.observations.camera
+    level = np.array([1.4, 0.8])
+    own = bent.problem.network.layout.all("amplitude")[:2]
+    found = influence(bent, own)
+    pixels = np.zeros((len(camera), 2, 2))
+    for rows, block in zip(scene.tables, found.pixels, strict=True):
+        pixels[rows] = block
+    white = np.sum(blocks_of(scene, found) ** 2, axis=0)
+    more = np.sum(((level[camera] ** 2 - 1.0)[:, None, None] * pixels**2), axis=(0, 1))
+    (one,) = met(bent, Correlation(), level)
+    np.testing.assert_allclose(one.ratio[:2], (white + more) / white, rtol=1e-9)
+    # The image that settles is that of the first camera, which is the noisier one.
+    assert np.all(one.ratio[:2] > 1.1)
+
+
+def test_levels_are_recovered_and_not_imagined(bent):
+    camera, equal = bent.scene.recording.observations.camera, 0
+    for seed in range(40):
+        noise = np.random.default_rng(seed).standard_normal((len(camera), 2))
+        equal += np.all(levels(bent, noise) == 1.0)
+        left, right = levels(bent, noise * np.array([2.5, 1.0])[camera][:, None])
+        assert left / right == pytest.approx(2.5, rel=0.3)
+    assert equal >= 38
 
 
 def test_there_may_be_no_effect():

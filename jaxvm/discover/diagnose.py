@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxvm.compiling import forget_compiled_if_many
 from jaxvm.discover.advice import advise, under_its_name
+from jaxvm.discover.averaged import with_forms
 from jaxvm.discover.collocation import collocate
 from jaxvm.discover.constants import run_away
 from jaxvm.discover.diagnosis import Diagnosis, Finding, Quality
@@ -27,7 +28,7 @@ from jaxvm.discover.heldout import (
 from jaxvm.discover.inputs import variances_by_inputs
 from jaxvm.discover.instants import at_best_instants, with_spread
 from jaxvm.discover.locate import ResidualTable, locate, residual_table
-from jaxvm.discover.noise import Correlation, met
+from jaxvm.discover.noise import Correlation, levels, met
 from jaxvm.discover.scatter import ALIKE, likeness
 from jaxvm.discover.scopes import sharing
 from jaxvm.discover.search import ALPHA, Search
@@ -97,6 +98,7 @@ def diagnose(
     findings = [replace(f, share=float(f.drop / max(excess, 1e-9))) for f in findings]
     findings = _with_final_values(final, findings, len(effects), parts.sound)
     findings = [with_spread(f, own) for f, own in zip(findings, instants, strict=True)]
+    findings = [with_forms(final, f, len(effects) + k, parts.sound) for k, f in enumerate(findings)]
     findings = [
         replace(f, sharing=sharing(current, len(effects) + k, parts, f.noise))
         for k, f in enumerate(findings)
@@ -241,14 +243,16 @@ def _with_final_values(
 ) -> list[Finding]:
     """Findings with the values of the fit to all epochs.
 
-    Noise that is correlated widens them, and so do errors of the log. An instant that no fit
-    refines keeps the spread of those that did nearly as well.
+    Noise that is correlated widens them, and so do errors of the log; where a camera is noisier
+    than others, what it shows is known less well. An instant that no fit refines keeps the spread
+    of those that did nearly as well.
     """
-    noise = Correlation.of(final, fitted_residuals(final, sound))
+    left = fitted_residuals(final, sound)
+    noise = Correlation.of(final, left)
     values = zip(
         final.scene.fitted_effects(),
         effect_deviations(final),
-        met(final, noise),
+        met(final, noise, levels(final, left)),
         variances_by_inputs(final),
         strict=True,
     )

@@ -34,8 +34,8 @@ class Family:
 
     Hypothesis (g, c, s) is valid where the scope is of the group's kind; `valid` has the shape
     [groups, courses, scopes]. `kinds` are those of the courses' drivers, `asked` the number of
-    drivers and forms of that kind that the family asks about, `named` that in which each entry of
-    the catalogue is asked.
+    drivers and forms of that kind that the family asks about, `named` that among which each entry
+    of the catalogue, by whether it varies, shares its prior.
     """
 
     groups: tuple[Group, ...]
@@ -44,7 +44,7 @@ class Family:
     valid: np.ndarray
     kinds: tuple[str, ...]
     asked: tuple[int, ...]
-    named: dict[str, int]
+    named: dict[tuple[str, bool], int]
 
     @property
     def n_terms(self) -> int:

@@ -30,6 +30,10 @@ _SHOWN = 9.2
 _FELT = 1e-3
 """Share of the power of shifts of images that must be left in residuals for them to tell."""
 
+_UNEQUAL, _OF_MEDIAN = 3.0, 1.17
+"""Standard deviations by which a camera's noise must differ, and that of the logarithm of a median
+absolute value, times the root of the number of values: 1 / (4 z phi(z)) at z = 0.6745."""
+
 _BY_EPOCH = (0.0, *np.exp(-1.0 / np.geomspace(0.3, 50.0, 24)))
 """Correlations of neighbouring epochs that are tried."""
 
@@ -111,7 +115,8 @@ class Met:
     """What correlated noise does to the estimates of one effect.
 
     Attributes:
-        ratio: of the variances of its amplitudes, then of its constants, to those in white noise.
+        ratio: of the variances of its amplitudes, then of its constants, to those in white noise of
+            one level.
         inflation, freedom: its drop of chi-square under noise alone is about `inflation` times a
             chi-square with so many degrees of freedom (Satterthwaite 1946).
     """
@@ -121,8 +126,38 @@ class Met:
     freedom: float
 
 
-def met(fitted: Adjustment, noise: Correlation) -> list[Met]:
-    """What noise of this correlation does to each effect of a fitted scene."""
+def levels(
+    fitted: Adjustment, residual: Float[np.ndarray, "observations 2"]
+) -> Float[np.ndarray, " cameras"]:
+    """Standard deviation of every camera's noise over that of all, by median absolute residuals.
+
+    1 where the difference may be chance. Sigmas that a recording states may be right for one camera
+    and wrong for another: what one of them shows is known by its own noise.
+
+    Args:
+        fitted: the scene's adjustment.
+        residual: its whitened residuals in the order of the recording, NaN where not fitted.
+    """
+    scene = fitted.scene
+    camera, found = scene.recording.observations.camera, np.ones(len(scene.model.cameras))
+    size = np.abs(residual)
+    overall = np.nanmedian(size) if np.isfinite(size).any() else 0.0
+    for k in range(len(found)):
+        own = size[camera == k]
+        own = own[np.isfinite(own)]
+        if overall > 0.0 and len(own) and np.median(own) > 0.0:
+            ratio = float(np.median(own) / overall)
+            if abs(np.log(ratio)) > _UNEQUAL * _OF_MEDIAN / np.sqrt(len(own)):
+                found[k] = ratio
+    return found
+
+
+def met(
+    fitted: Adjustment,
+    noise: Correlation,
+    levels: Float[np.ndarray, " cameras"] | None = None,
+) -> list[Met]:
+    """What noise of this correlation, and of a level for each camera, does to each effect."""
     scene, layout = fitted.scene, fitted.problem.network.layout
     amplitude, constant = layout.all("amplitude"), layout.all("constant")
     places = [
@@ -130,7 +165,8 @@ def met(fitted: Adjustment, noise: Correlation) -> list[Met]:
         for columns, constants in scene.places()
     ]
     sizes = [columns.stop - columns.start for columns, _ in scene.places()]
-    if not places or noise.white:
+    level = np.ones(len(scene.model.cameras)) if levels is None else levels
+    if not places or (noise.white and np.all(level == 1.0)):
         return [Met(np.ones(len(own)), 1.0, n) for own, n in zip(places, sizes, strict=True)]
     found = influence(fitted, np.concatenate(places))
     n_observations = len(scene.recording.observations.epoch)
@@ -140,7 +176,8 @@ def met(fitted: Adjustment, noise: Correlation) -> list[Met]:
     blocks = [np.reshape(block, (-1, block.shape[-1])) for block in jax.tree.leaves(found)]
     white = np.sum([block.T @ block for block in blocks], axis=0)
     flat = pixels.reshape(-1, pixels.shape[2])
-    correlated = white - flat.T @ flat + noise.between(scene, pixels)
+    scaled = pixels * level[scene.recording.observations.camera][:, None, None]
+    correlated = white - flat.T @ flat + noise.between(scene, scaled)
     ends = np.cumsum([len(own) for own in places])
     return [
         _met(white[own, own], correlated[own, own], n)

@@ -116,7 +116,8 @@ def member(family: Family, index: tuple[int, int, int], scene: Scene) -> Hypothe
     kinds = kinds_in_scope(family.kinds[index[1]], course.driver, scope, scene)
     entries = entries_for(group.terms, group.entity, kinds, course.form)
     each = len(family.groups) if group.mark is not None else 1
-    asked = {entry.id: each * family.named[entry.id] * _variants(entry, group) for entry in entries}
+    varies = course.form != "constant"
+    asked = {e.id: each * family.named[e.id, varies] * _variants(e, group) for e in entries}
     asked[""] = each * family.asked[index[1]]
     return Hypothesis(group, course, scope, entries, asked)
 
@@ -129,8 +130,12 @@ def _variants(entry: Entry, group: Group) -> int:
     return sum(alike == [(t.port, t.driver, t.basis) for t in own] for own in entry.groups) or 1
 
 
-def _asked_of_names(scene: Scene, courses: list[Course]) -> dict[str, int]:
-    """Number of drivers and forms in which each entry of the catalogue is asked of one body."""
+def _asked_of_names(scene: Scene, courses: list[Course]) -> dict[tuple[str, bool], int]:
+    """Number of drivers and forms among which each entry of the catalogue shares its prior.
+
+    By its name and by whether it varies. They are those in which it is asked of one body; where it
+    may also never change, that has one half of the prior, and all that varies the other.
+    """
     model = scene.model
     one = {
         kind: Scope(**{kind: (bodies[0].name,)})
@@ -153,14 +158,22 @@ def _asked_of_names(scene: Scene, courses: list[Course]) -> dict[str, int]:
         if _follows(scene, scope, course)
     }
 
-    def asked(entry: Entry) -> int:
-        own = (kinds.get((entry.entity, *named), ()) for named in distinct)
-        return sum(entry.takes(k, form) for k, (_, form) in zip(own, distinct, strict=True))
+    def asked(entry: Entry, varies: bool) -> int:
+        return sum(
+            entry.takes(kinds.get((entry.entity, driver, form), ()), form)
+            for driver, form in distinct
+            if (form != "constant") == varies
+        )
 
-    return {entry.id: max(asked(entry), 1) for entry in CATALOGUE}
+    shares = {}
+    for entry in CATALOGUE:
+        own = {varies: asked(entry, varies) for varies in (False, True)}
+        halves = 2 if all(own.values()) else 1
+        shares |= {(entry.id, varies): max(halves * n, 1) for varies, n in own.items()}
+    return shares
 
 
-def _family(scene: Scene, groups, courses, scopes, named: dict[str, int]) -> Family:
+def _family(scene: Scene, groups, courses, scopes, named: dict[tuple[str, bool], int]) -> Family:
     driven = [driver_kind(scene, course.driver) for course in courses]
     distinct = set(zip(driven, ((c.driver, c.form) for c in courses), strict=True))
     asked = Counter(kind for kind, _ in distinct)

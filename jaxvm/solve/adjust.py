@@ -354,10 +354,13 @@ def degrees_of_freedom(problem: Problem, diagonal) -> int:
 
     `diagonal` is that of the normal matrix.
     """
-    used = sum(
-        int(np.sum(np.asarray(f.weight) > 0)) * f.sigma.shape[1] for f in problem.network.factors()
-    )
-    return used - int(np.sum(np.asarray(diagonal) > 0))
+    return n_used(problem) - int(np.sum(np.asarray(diagonal) > 0))
+
+
+def n_used(problem: Problem) -> int:
+    """Number of components of the weighted-in observations."""
+    factors = problem.network.factors()
+    return sum(int(np.sum(np.asarray(f.weight) > 0)) * f.sigma.shape[1] for f in factors)
 
 
 def _why(last, max_steps) -> str:

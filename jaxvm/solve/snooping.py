@@ -18,7 +18,7 @@ from jaxvm.compiling import program
 from jaxvm.network.factors import LinkFactor
 from jaxvm.network.relations import held_poses, link_relations
 from jaxvm.network.scene import Scene
-from jaxvm.solve.adjust import Adjustment, adjust
+from jaxvm.solve.adjust import Adjustment, adjust, n_used
 from jaxvm.solve.arrow import factorise
 from jaxvm.solve.large import is_large
 from jaxvm.solve.problem import Problem
@@ -275,12 +275,18 @@ def _where_link(scene: Scene, k: int) -> str:
 
 
 def robust_variance(adjustment: Adjustment) -> float:
-    """Squared scale of whitened pixel residuals from their median absolute value."""
+    """Variance factor of pixel noise from the median absolute whitened residual.
+
+    Residuals are smaller than noise, for unknowns follow it: on the whole by the share of the
+    degrees of freedom in the observations.
+    """
     values = np.concatenate([np.asarray(r).ravel() for r in adjustment.residuals().pixels])
     weights = np.concatenate(
         [np.repeat(np.asarray(f.weight)[: f.n_real], 2) for f in adjustment.problem.network.pixels]
     )
-    return float((np.median(np.abs(values[weights > 0])) / 0.67449) ** 2)
+    used, freedom = n_used(adjustment.problem), adjustment.degrees_of_freedom
+    kept = freedom / used if freedom > 0 else 1.0
+    return float((np.median(np.abs(values[weights > 0])) / 0.67449) ** 2 / kept)
 
 
 def _where(scene: Scene, row: int) -> str:
