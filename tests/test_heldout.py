@@ -166,6 +166,20 @@ def test_odds_prove_what_errors_alone_can_not(known, seed, monkeypatch):
     assert isinstance(accept(before, leading, parts, heldout, 0, set(), ask_odds=True), str)
 
 
+def test_who_promised_more_than_the_leading_one_kept_comes_before_it(known):
+    """A step that was foretold as ten times what it is stands in for a trend no longer."""
+    parts, before, _, found = drawn(known, 6e-3, seed=1)
+    heldout, middle = parts.evaluate(before.scene), float(np.median(known.recording.time)) + 1e-3
+    step = replace(AGES, course=Course("time", "step", (middle,)))
+    candidate = refit(before, step, np.zeros(1), parts)
+    assert candidate is not None and STRONG < candidate.evidence < 0.9 * found.evidence
+    leading = [(step, 10.0 * found.evidence, np.zeros(1)), (AGES, found.evidence, np.zeros(1))]
+    accepted = accept(before, leading, parts, heldout, 0, set())
+    assert not isinstance(accepted, str) and accepted.chosen.hypothesis.same(AGES)
+    alone = accept(before, leading[:1], parts, heldout, 0, set())
+    assert not isinstance(alone, str) and alone.chosen.hypothesis.same(step)
+
+
 def test_what_no_epoch_shows_has_no_size(known):
     parts, before, _, found = drawn(known, 8e-4, seed=14)
     late = Effect("late", FOCAL, "time", "step", (1e4,), 0.0, CAMERA, (0.0,))

@@ -81,24 +81,32 @@ def accept(
     least = leading[0][1] - max(_NEAR, _TIE * abs(leading[0][1]))
     near = [item for item in leading[:_CANDIDATES] if item[1] >= least]
     rest = [item for item in leading[len(near) :] if item[0].entries]
+    groups = [near, rest[:_CANDIDATES]]
+    asked: set[tuple] = set()
     tried: list[Candidate] = []
-    for some in (near, rest[:_CANDIDATES]):
-        refitted: list[Candidate] = []
+    refitted: list[Candidate] = []
+    while groups:
+        some = [item for item in groups.pop(0) if _key(item[0]) not in asked | hopeless]
+        asked |= {_key(hypothesis) for hypothesis, *_ in some}
         # Free forms come last: what a name explains as well needs no wide fit.
         for hypothesis, foretold, amplitudes in sorted(some, key=lambda item: len(item[2]) > FREE):
-            key = (identity(hypothesis), hypothesis.course)
             best = max((c.evidence for c in refitted), default=-np.inf)
-            free = len(amplitudes) > FREE
-            if key in hopeless or (free and foretold < max(best, _least(hypothesis))):
+            if len(amplitudes) > FREE and foretold < max(best, _least(hypothesis)):
                 continue
             candidate = refit(current, hypothesis, amplitudes, split)
             tried += [] if candidate is None else [candidate]
             if candidate is None or candidate.evidence <= 0.0:
-                hopeless.add(key)
+                hopeless.add(_key(hypothesis))
             else:
                 refitted.append(candidate)
         refitted = _comparable(refitted, current)
         for candidate in refitted:
+            if _key(candidate.hypothesis) in hopeless:
+                continue
+            promising = _promising(leading, candidate, asked | hopeless)
+            if promising:
+                groups.insert(0, promising[:_CANDIDATES])
+                break
             shown = split.evaluate(candidate.adjustment.scene)
             proof = gain(heldout, shown, seed)
             strong = candidate.evidence > STRONG and _is_foretold(candidate)
@@ -113,8 +121,26 @@ def accept(
                     if c is not candidate and candidate.evidence - c.evidence < gap
                 )
                 return Accepted(candidate, others, shown, proof, tuple(_comparable(tried, current)))
-            hopeless.add((identity(candidate.hypothesis), candidate.hypothesis.course))
+            hopeless.add(_key(candidate.hypothesis))
+        else:
+            refitted = []
     return short(leading[0][0])
+
+
+def _key(hypothesis: Hypothesis) -> tuple:
+    """What is fitted once."""
+    return identity(hypothesis), hypothesis.course
+
+
+def _promising(leading, candidate: Candidate, known: set[tuple]) -> list:
+    """What promises clearly more than a candidate gave that kept less than its tangent promised."""
+    return [
+        item
+        for item in leading
+        if _key(item[0]) not in known
+        and len(item[2]) <= FREE
+        and item[1] - max(_NEAR, _TIE * item[1]) > candidate.evidence
+    ]
 
 
 def _is_foretold(candidate: Candidate) -> bool:
