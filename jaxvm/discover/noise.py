@@ -24,8 +24,12 @@ from jaxvm.solve.covariance import influence
 LONGEST = 0.3
 """Longest distance in time that is looked at, as a share of the recording."""
 
-_SHOWN = 9.2
-"""Chi-square with which a process must show: that of 1 % for two unknowns."""
+_SHOWN, _SHOWN_OF_IMAGES = 9.2, 20.0
+"""Chi-square with which a process must show: that of 1 % for two unknowns.
+
+Images that share noise of which marks remember nothing must show it beyond doubt: an effect that is
+not quite what was fitted leaves as much, and would then speak against what was found of it.
+"""
 
 _FELT = 1e-3
 """Share of the power of shifts of images that must be left in residuals for them to tell."""
@@ -85,7 +89,7 @@ class Correlation:
         share, m = _process(own, pairs, expected, beside=expected[0])
         of_marks = (1.0 - share) * expected[0] + share * expected[m]
         shared, sure = _of_images(fitted, each[mark, epoch], used, at, of_marks)
-        common, k = _process(shared, sure, expected)
+        common, k = _process(shared, sure, expected, shown=_SHOWN_OF_IMAGES)
         if share > 0.0 and not common > 0.0:
             # What images share need not be shown where marks remember: likely they do, too.
             (common, _), k = _process(shared, sure, expected[m : m + 1], shown=0.0), m
