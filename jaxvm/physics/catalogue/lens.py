@@ -212,8 +212,9 @@ LENS: tuple[Entry, ...] = (
         "window-off-centre", "a dome or a wedged window stands off the axis", (21,),
         _DOME, ALWAYS, ALWAYS, "camera",
         (1e-5, 3e-2), "decentring of the lens", "take the window away, or turn it",
-        "The camera does not sit in the middle of its dome, or its window is a wedge. The image is "
-        "bent to one side, like that of a lens whose elements do not share one axis.",
+        "The camera does not sit in the middle of its dome, by so much where that has a radius of "
+        "70 mm, or its window is a wedge. The image is bent to one side, like that of a lens whose "
+        "elements do not share one axis.",
     ),
     Entry(
         "decentring-drift", "the decentring drifts with temperature", (46,),
