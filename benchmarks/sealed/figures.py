@@ -13,9 +13,8 @@ from pathlib import Path
 import numpy as np
 from judge import SHOWN, Z_90
 from matplotlib.figure import Figure
-from tally import FLOOR_RATIO, wilson
+from tally import FLOOR_RATIO, page_of, wilson
 
-SEEDS = Path(__file__).parent / "seeds"
 GOOD, BAD, INK = "#0f766e", "#c2410c", "#334155"
 MOST_NAMES = 80
 
@@ -146,8 +145,6 @@ def main() -> None:
     for folder in options.folders:
         rows += json.loads((folder / "results.json").read_text())["rows"]
     label = options.label or "-".join(folder.resolve().name for folder in options.folders)
-    folder = SEEDS / label
-    folder.mkdir(parents=True, exist_ok=True)
     drawn = {
         "detection": detection,
         "confusion": confusion,
@@ -156,7 +153,7 @@ def main() -> None:
         "heldout": held_out,
     }
     for name, draw in drawn.items():
-        file = folder / f"{name}.png"
+        file = page_of(label, f"{name}.png")
         draw(rows).savefig(file, dpi=120)
         print(f"written {file}")
 

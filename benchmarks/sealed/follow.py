@@ -23,9 +23,8 @@ from judge import catalogue_rows, claims
 from names import Facts, same_name
 from score import sealed_key
 from solve import copy_recording, environment
+from tally import page_of
 from world import record
-
-SEEDS = Path(__file__).parent / "seeds"
 
 
 def asked(folder: Path, entries: list[dict]) -> list[dict]:
@@ -167,9 +166,7 @@ def main() -> None:
             print(f"{words}  ({case['chance']:.0%}): {state}", flush=True)
     label = options.label or folder.name
     text = markdown(label, results)
-    table = SEEDS / label / "follow.md"
-    table.parent.mkdir(parents=True, exist_ok=True)
-    table.write_text(text, encoding="utf-8")
+    page_of(label, "follow.md").write_text(text, encoding="utf-8")
     print(text.splitlines()[2])
     (folder / "follow.json").write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
 

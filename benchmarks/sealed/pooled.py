@@ -5,11 +5,9 @@
 
 import argparse
 import re
-from pathlib import Path
 
-from tally import wilson
+from tally import SEEDS, wilson
 
-SEEDS = Path(__file__).parent / "seeds"
 SHARES = ("1", "2", "2b", "2c", "4", "5", "6a", "6c", "7", "8", "9", "9a", "9b")
 
 

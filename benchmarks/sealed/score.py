@@ -16,10 +16,9 @@ from pathlib import Path
 
 import numpy as np
 from judge import judge
-from tally import by_effect, figures, markdown
+from tally import by_effect, figures, markdown, page_of
 
 HERE = Path(__file__).parent
-SEEDS = HERE / "seeds"
 
 
 def sealed_key(folder: Path) -> tuple[list[dict], str]:
@@ -166,8 +165,7 @@ def main() -> None:
     label = options.label or "-".join(folder.resolve().name for folder in options.folders)
     part = "" if len(rows) == made else f" ({len(rows)} of {made} recordings)"
     page = markdown(rows, f"Sealed benchmark {label}{part}", digests)
-    table = SEEDS / label / "results.md"
-    table.parent.mkdir(parents=True, exist_ok=True)
+    table = page_of(label, "results.md")
     table.write_text(page, encoding="utf-8")
     print(page.split("## What went wrong")[0])
     print(f"written {table}")

@@ -5,12 +5,13 @@ from types import SimpleNamespace
 
 import jax
 import numpy as np
+import pooled
 import pytest
 from judge import _sizes, claims, covered, judge
 from names import Facts, same_name, same_place
 from power import facts_of, plain_fit, shown, whitened
 from scipy.integrate import solve_ivp
-from tally import odds_of_noise, wilson
+from tally import failures, figures, odds_of_noise, wilson
 from world import EFFECTS, heat, record
 from world.effect import Site
 
@@ -214,6 +215,31 @@ def test_claims_and_intervals():
     finding = dict(REPORT["findings"][0], equivalents=[{"rows": [51], "where": {}, "weight": 0.01}])
     assert [claim["rows"] for claim in claims(finding)] == [[29], [51]]
     assert covered(1.0) and not covered(-2.0)
+
+
+def test_a_size_that_is_far_off_is_told():
+    right = judge(ENTRY, REPORT, SHOWN, ROWS.get)
+    (effect,) = right["effects"]
+    assert effect["first"] and not [text for text in failures([right]) if "size off" in text]
+    wrong = right | {"effects": [effect | {"z": [-3.21, 0.4]}]}
+    (told,) = [text for text in failures([wrong]) if "size off" in text]
+    assert told.endswith("size off by -3.2 standard deviations")
+    by_number = {figure.number: figure for figure in figures([wrong])}
+    assert by_number["9"].value == 0.5
+    assert by_number["9c"].value == pytest.approx(0.5 * (3.21 + 0.4))
+
+
+def test_shares_of_several_seeds_add_up(tmp_path, monkeypatch):
+    monkeypatch.setattr(pooled, "SEEDS", tmp_path)
+    for seed, value, cases in (("1", "90.0", 10), ("2", "97.5", 40)):
+        (tmp_path / seed).mkdir()
+        row = f"| 1 | right physics | {value} % | 80 % – 99 % | {cases} | at least 97 % | no |"
+        (tmp_path / seed / "results.md").write_text(f"# Table\n\n{row}\n", encoding="utf-8")
+    assert pooled.shares("2") == {"1": ("right physics", 39, 40)}
+    assert "| 90.0 % of 10 | 97.5 % of 40 | 96.0 % of 50 |" in pooled.markdown(["1", "2"])
+    told = "9 of 12 findings that were promised"
+    (tmp_path / "1" / "follow.md").write_text(f"# Advice\n\n{told}\n", encoding="utf-8")
+    assert pooled.advice("1") == (9, 12) and pooled.advice("2") is None
 
 
 def test_sizes_of_vectors_and_waves():
