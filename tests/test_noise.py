@@ -247,6 +247,18 @@ def test_levels_are_recovered_and_not_imagined(bent):
     assert equal >= 38
 
 
+def test_what_only_images_share_must_show_beyond_doubt(still):
+    """A little of it is left by an effect that is not quite what was fitted; beside marks that
+    remember a little is believed."""
+    plainly, hardly, beside = (0.0, 0.0, 0.03), (0.0, 0.0, 0.004), (0.3, 0.7, 0.006)
+    told = {
+        shares: sum(shown(still, seed, *shares, 0.8).image > 0.0 for seed in range(20))
+        for shares in (plainly, hardly, beside)
+    }
+    # Measured: 20, 3 and 20; with the threshold of marks' own noise 20, 11 and 20.
+    assert told[plainly] >= 19 and told[hardly] <= 6 and told[beside] >= 18
+
+
 def test_there_may_be_no_effect():
     assert met(adjusted("board")[1], Correlation(0.3, 0.6)) == []
 

@@ -88,18 +88,10 @@ def accept(
     while groups:
         some = [item for item in groups.pop(0) if _key(item[0]) not in asked | hopeless]
         asked |= {_key(hypothesis) for hypothesis, *_ in some}
-        # Free forms come last: what a name explains as well needs no wide fit.
-        for hypothesis, foretold, amplitudes in sorted(some, key=lambda item: len(item[2]) > FREE):
-            best = max((c.evidence for c in refitted), default=-np.inf)
-            if len(amplitudes) > FREE and foretold < max(best, _least(hypothesis)):
-                continue
-            candidate = refit(current, hypothesis, amplitudes, split)
-            tried += [] if candidate is None else [candidate]
-            if candidate is None or candidate.evidence <= 0.0:
-                hopeless.add(_key(hypothesis))
-            else:
-                refitted.append(candidate)
-        refitted = _comparable(refitted, current)
+        best = max((c.evidence for c in refitted), default=-np.inf)
+        fitted = _refits(current, some, split, best, hopeless)
+        tried += fitted
+        refitted = _comparable(refitted + [c for c in fitted if c.evidence > 0.0], current)
         for candidate in refitted:
             if _key(candidate.hypothesis) in hopeless:
                 continue
@@ -114,17 +106,34 @@ def accept(
                 after = replace(candidate.adjustment, scene=shown.scene)
                 proof = replace(proof, odds=split.odds(current, in_all(), after))
             if proof.proven and _is_determined(candidate, shown):
-                gap = max(_OPEN[0], _OPEN[1] * abs(candidate.evidence))
-                others = tuple(
-                    c
-                    for c in refitted
-                    if c is not candidate and candidate.evidence - c.evidence < gap
-                )
-                return Accepted(candidate, others, shown, proof, tuple(_comparable(tried, current)))
+                near = _close_behind(candidate, refitted)
+                return Accepted(candidate, near, shown, proof, tuple(_comparable(tried, current)))
             hopeless.add(_key(candidate.hypothesis))
         else:
             refitted = []
     return short(leading[0][0])
+
+
+def _refits(current: Adjustment, some, split: Split, best: float, hopeless: set) -> list[Candidate]:
+    """What can be fitted, as it comes; what can't, or explains nothing, is hopeless."""
+    fitted: list[Candidate] = []
+    # Free forms come last: what a name explains as well needs no wide fit.
+    for hypothesis, foretold, amplitudes in sorted(some, key=lambda item: len(item[2]) > FREE):
+        if len(amplitudes) > FREE and foretold < max(best, _least(hypothesis)):
+            continue
+        candidate = refit(current, hypothesis, amplitudes, split)
+        if candidate is None or candidate.evidence <= 0.0:
+            hopeless.add(_key(hypothesis))
+        if candidate is not None:
+            fitted.append(candidate)
+            best = max(best, candidate.evidence)
+    return fitted
+
+
+def _close_behind(chosen: Candidate, refitted: list[Candidate]) -> tuple[Candidate, ...]:
+    """Others that fell behind only a little."""
+    gap = max(_OPEN[0], _OPEN[1] * abs(chosen.evidence))
+    return tuple(c for c in refitted if c is not chosen and chosen.evidence - c.evidence < gap)
 
 
 def _key(hypothesis: Hypothesis) -> tuple:
