@@ -14,7 +14,7 @@ never fitted is the proof.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtr
 
 from jaxvm.discover.heldout import Gain, HeldOut, Split, gain
 from jaxvm.discover.scatter import ALIKE, Neighbours, clipped, likeness, neighbours
@@ -136,7 +136,7 @@ def collocate(fitted: Adjustment, heldout: HeldOut, parts: Split, seed: int = 0)
         size_stds_rad=0.5 * stds[[*cameras]] / sizes * unit,
         length_rad=float(reach / focal[0]),
         lasting=shown.lasting(scene, cameras),
-        p_value=float(min(n_cameras * norm.sf((variances / stds)[[*cameras]].max()), 1.0)),
+        p_value=float(min(n_cameras * ndtr(-(variances / stds)[[*cameras]].max()), 1.0)),
         drop=float(np.sum(marks.error**2) - np.sum(left**2)),
         by_distance=_by_distance(marks, left, cameras),
         gain=proof,

@@ -7,7 +7,7 @@ cameras, targets, marks, regions of the image and of the target, epochs and reco
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import f as fisher
+from scipy.special import fdtrc
 
 from jaxvm.network.scene import Scene
 
@@ -82,7 +82,7 @@ def locate(scene: Scene, table: ResidualTable, alpha: float = 1e-4) -> list[Plac
             if n_in < 10 or n_out < 10:
                 continue
             ratio = float(square[inside].mean() / square[outside].mean())
-            if ratio > 1.15 and fisher.sf(ratio, 2 * n_in, 2 * n_out) * n_tests < alpha:
+            if ratio > 1.15 and fdtrc(2 * n_in, 2 * n_out, ratio) * n_tests < alpha:
                 found.append(Place(kind, name, ratio, n_in))
     found.sort(key=lambda place: -(place.variance_ratio - 1.0) * np.sqrt(place.count))
     return found

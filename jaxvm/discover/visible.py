@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from jaxvm.discover.ranking import Ranking, Scores
 from jaxvm.discover.space import member
@@ -21,7 +21,7 @@ def smallest_visible(
     number of hypotheses. Hypotheses of one column, constant or linear in a driver; the most
     favourable place counts.
     """
-    level = norm.isf(0.025 / max(ranking.n, 1)) + norm.isf(0.2)
+    level = -ndtri(0.025 / max(ranking.n, 1)) - ndtri(0.2)
     unit = {port.name: port.unit for port in PORTS}
     smallest: dict[str, tuple[float, str]] = {}
     for scores in ranking.scores:

@@ -14,7 +14,6 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 from scipy.optimize import least_squares
-from scipy.signal import lfilter
 
 from jaxvm.identify.gains import SLOWEST, Fit, foretold_density, linear_gains, prior_widths
 from jaxvm.identify.inputs import Inputs, are_power
@@ -103,7 +102,7 @@ class _Samples:
         """Inputs behind 1 / A(q), every delay, in equilibrium at the first sample."""
         rows = self.late(orders)
         settled = rows[:, :1] / (1.0 + np.sum(a))
-        moved = lfilter([1.0], np.append(1.0, a), rows - rows[:, :1], axis=1)
+        moved = _behind(a, rows - rows[:, :1])
         return settled + moved
 
     def at_epochs(self, rows: np.ndarray) -> np.ndarray:
@@ -116,8 +115,16 @@ class _Samples:
         for k in range(len(a)):
             pulse = np.zeros(len(self.time) - self.before)
             pulse[k] = 1.0
-            out.append(np.append(np.zeros(self.before), lfilter([1.0], np.append(1.0, a), pulse)))
+            out.append(np.append(np.zeros(self.before), _behind(a, pulse)))
         return self.at_epochs(np.array(out)) if out else np.zeros((len(self.epochs), 0))
+
+
+def _behind(a: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Rows behind 1 / A(q), from rest."""
+    # Half a second of imports that only who fits such models has to wait for.
+    from scipy.signal import lfilter
+
+    return lfilter([1.0], np.append(1.0, a), rows, axis=-1)
 
 
 def is_even(time: Float[np.ndarray, " epochs"]) -> bool:

@@ -6,12 +6,12 @@ not even for that), so that trials of several runs add up.
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.stats import chi2, norm
+from scipy.special import chdtri, ndtri
 
 LEVELS = (0.5, 0.6827, 0.9, 0.95, 0.99)
 """Levels of the two-sided intervals whose coverage is counted."""
 
-_DEVIATIONS = norm.ppf(0.5 + 0.5 * np.array(LEVELS))
+_DEVIATIONS = ndtri(0.5 + 0.5 * np.array(LEVELS))
 
 _WAITING = 1 << 18
 """Numbers that are kept until they are counted in bins."""
@@ -84,7 +84,7 @@ class Statistics:
     def interval(self, level: float = 0.95) -> Float[np.ndarray, "2 m"]:
         """Interval of the true root mean squares (chi-square, for normal errors)."""
         n = max(self.count, 1)
-        bounds = chi2.ppf([0.5 + 0.5 * level, 0.5 - 0.5 * level], n)
+        bounds = chdtri(n, [0.5 - 0.5 * level, 0.5 + 0.5 * level])
         return self.rms * np.sqrt(n / bounds)[:, None]
 
     def quantile(self, share: float) -> Float[np.ndarray, " m"]:

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from jaxvm.geometry import LensFamily, pose_from_vector, so3_exp
 from jaxvm.network.residual import parts_of, predict_pixels
@@ -210,7 +210,7 @@ def _best(seen: Sighting, starts: Float[np.ndarray, "views 6"]) -> ViewPoses:
     cost, pose = np.array(found.cost), np.array(found.observer_from_target)
     covariance = np.array(found.covariance)
     used = np.any(np.asarray(seen.whitener) != 0.0, axis=(2, 3))
-    limit = chi2.isf(_BY_CHANCE, np.maximum(2 * used.sum(axis=1) - 6, 1))
+    limit = chdtri(np.maximum(2 * used.sum(axis=1) - 6, 1), _BY_CHANCE)
     again = np.flatnonzero(~(cost <= limit))
     if len(again):
         second = by_blocks(_located, jax.tree.map(lambda leaf: np.asarray(leaf)[again], seen))

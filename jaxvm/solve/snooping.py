@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from jaxvm.compiling import program
 from jaxvm.network.factors import LinkFactor
@@ -111,7 +111,7 @@ def snoop(
     """
     weights = weights or tuple(np.ones(len(rows)) for rows in scene.tables)
     rejected: list[Rejected] = []
-    limit = chi2.isf(alpha, 2)
+    limit = chdtri(2, alpha)
     adjustment = adjust(scene, weights=weights)
     for _ in range(max_rounds):
         tests = image_point_tests(adjustment)
@@ -207,14 +207,14 @@ def snoop_links(
     square = np.sum(np.asarray(robust.residuals().links) ** 2, axis=1) / scale
     ends = _ends(scene)
     weights = np.ones(len(square))
-    weights = _without(ends, weights, square * (square > _FAR * chi2.isf(alpha, 6)))
+    weights = _without(ends, weights, square * (square > _FAR * chdtri(6, alpha)))
     tried: set[bytes] = set()
     while True:
         tried.add(weights.tobytes())
         adjustment = adjust(robust.scene, method, link_weights=weights)
         test, freedom = link_tests(adjustment)
         test = test / scale
-        fails = test > chi2.isf(alpha, np.maximum(freedom, 1))
+        fails = test > chdtri(np.maximum(freedom, 1), alpha)
         changed = np.where((weights == 0.0) & ~fails, 1.0, weights)
         worst = _worst_at_both_ends(ends, np.where(fails & (weights > 0.0), test, 0.0))
         changed = _without(ends, changed, np.where(worst, test, 0.0))
