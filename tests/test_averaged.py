@@ -7,6 +7,7 @@ import pytest
 from networks import board_recording, predicted
 
 from jaxvm.discover.averaged import with_forms
+from jaxvm.discover.diagnose import _spreads
 from jaxvm.physics.effects import Effect, Scope, Term
 from jaxvm.recording import Drivers
 from jaxvm.solve.adjust import adjust
@@ -22,6 +23,7 @@ class Told:
     final_effect: Effect
     final_stds: tuple[float, ...]
     noise: float = 1.0
+    stds: tuple[float, ...] = ()
 
 
 def bent(form: str, late: tuple[float, ...], gain: float) -> Effect:
@@ -74,3 +76,17 @@ def test_what_has_no_gain_is_left_alone():
     effect = bent("rate", (), GAIN)
     found = Told(effect, (1e-5,))
     assert with_forms(None, found, 0, ()) is found  # type: ignore[arg-type]
+
+
+def test_amplitudes_beside_a_constant_that_was_held_are_no_better_known():
+    """A mark that settles for ever is a ramp: its whole way and its time constant go together."""
+    effect = Effect("it settles", (Term("target.bow_x"),), "time", "settling", (60.0, 9e4))
+    found = Told(effect, (), stds=(2e-3, 15.0, 8e5))
+    held = _spreads(found, effect, np.array([4e-5, 0.0, 0.0]), np.full(3, 4.0), np.zeros(3))
+    assert held == (2e-3, 15.0, 8e5)
+    free = _spreads(found, effect, np.array([4e-5, 3.0, 2e2]), np.full(3, 4.0), np.zeros(3))
+    np.testing.assert_allclose(free, (8e-5, 6.0, 4e2))
+    # An instant of a jump is never refined: the size of the jump is its own.
+    jump = Effect("it jumps", (Term("target.bow_x"),), "time", "step", (60.0,))
+    found = Told(jump, (), stds=(9e-5, 15.0))
+    assert _spreads(found, jump, np.array([4e-5, 0.0]), np.ones(2), np.zeros(2)) == (4e-5, 15.0)

@@ -36,6 +36,7 @@ from jaxvm.discover.visible import absorbed, smallest_visible
 from jaxvm.network.scene import Scene, build
 from jaxvm.network.start import start
 from jaxvm.physics.effects import Effect, capacity
+from jaxvm.physics.forms import FORMS
 from jaxvm.recording import Recording
 from jaxvm.solve.adjust import Adjustment, adjust, reference_sigma
 from jaxvm.solve.covariance import effect_deviations
@@ -260,18 +261,28 @@ def _with_final_values(
         replace(
             f,
             final_effect=effect,
-            final_stds=tuple(
-                np.where(
-                    np.array(stds) > 0.0,
-                    np.sqrt(noise.ratio * np.square(stds) + by_inputs),
-                    f.stds or stds,
-                ).tolist()
-            ),
+            final_stds=_spreads(f, effect, np.array(stds), noise.ratio, by_inputs),
             noise=noise.inflation,
         )
         # After the findings come first states.
         for f, (effect, stds, noise, by_inputs) in zip(findings, list(values)[given:], strict=False)
     ]
+
+
+def _spreads(f: Finding, effect: Effect, stds, ratio, by_inputs) -> tuple[float, ...]:
+    """Standard deviations of a finding's final amplitudes and constants.
+
+    What the final fit held has those of the search. Where it held a constant that a fit may refine
+    (it ran away: what settles so slowly is a ramp), amplitudes are no better known than in the
+    search, beside that constant.
+    """
+    found = np.sqrt(ratio * np.square(stds) + by_inputs)
+    former = np.array(f.stds or stds)
+    constants = FORMS[effect.form].constants
+    lost = stds[effect.n_columns :][[constant.refined for constant in constants]] == 0.0
+    if lost.any():
+        found = np.maximum(found, former)
+    return tuple(np.where(stds > 0.0, found, former).tolist())
 
 
 def _table(fitted: Adjustment, heldout: HeldOut | None, scene: Scene, sound) -> ResidualTable:
