@@ -47,8 +47,9 @@ from jaxvm.network.scene import Scene
 from jaxvm.physics.drivers import driven_by
 from jaxvm.solve.adjust import Adjustment
 
-_STACKED = 32
-"""Terms whose tangents are multiplied at a time, of as many groups as have them."""
+_STACKED, _AT_ONCE = 32, 1700000
+"""Terms whose tangents are multiplied at a time, of as many groups as have them; and numbers in
+these tangents, which bound the terms where observations are many: more is hardly faster."""
 
 _THREADS = min(os.cpu_count() or 1, 4)
 """More wait for Python's interpreter between their products: sixteen take longer than two."""
@@ -156,13 +157,14 @@ class ScoreTests:
         return Ranking(scores, np.max([own.null.max(axis=0) for own in scores], axis=0))
 
     def _batches(self) -> Iterator[list[tuple[int, int]]]:
-        """Groups by family and number, so many that they have about `_STACKED` terms."""
+        """Groups by family and number, so many that they have about `_STACKED` terms, or fewer."""
+        most = min(_STACKED, _AT_ONCE // self.arrangement.cells.residual.size)
         own, terms = [], 0
         for number, family in enumerate(self.battery.families):
             for g in range(len(family.groups)):
                 own.append((number, g))
                 terms += family.n_terms
-                if terms >= _STACKED:
+                if terms >= most:
                     yield own
                     own, terms = [], 0
         if own:
