@@ -21,8 +21,11 @@ from jaxvm.network.scene import Scene
 from jaxvm.physics.catalogue import CATALOGUE
 from jaxvm.physics.catalogue.entry import each
 
-ALIKE = 0.15
-"""Correlation of neighbouring marks of one image from which what is left is no noise of marks."""
+ALIKE = 0.08
+"""Correlation of neighbouring marks of one image from which what is left is no noise of marks.
+
+What a readout gives all marks of an image is a few percent of their noise.
+"""
 
 MOST_IMAGES = 400
 """Epochs up to which each can have an amount of its own."""
