@@ -252,20 +252,28 @@ def test_shimmering_air_is_named_and_measured(pair):
 
 
 def test_what_neighbours_share_a_little_is_haze_where_it_falls_off(pair):
-    """Less than a seventh of the variance; images that shift as a whole have noise in common."""
+    """A ninth of the variance; where images shift as a whole that is what is told and measured."""
     known = replace(pair.model, targets=(replace(pair.model.targets[0], free=()),))
     change = turbulent(pair, 0.018, 250.0, 0.0, 12)
     found = diagnose(replace(recorded(pair, change), model=known))
-    assert 0.0 < found.likeness < ALIKE
+    assert 0.08 < found.likeness < 0.15
     assert found.signal is not None and not found.signal.whole
     assert np.abs(found.signal.size_rad - 0.018 / 1100.0).max() < 4.0 * (
         found.signal.size_stds_rad.max()
     )
     obs = pair.observations
-    jumps = 0.018 * np.random.default_rng(13).standard_normal((2, N_EPOCHS, 2))
-    found = diagnose(replace(recorded(pair, jumps[obs.camera, obs.epoch]), model=known))
-    assert 0.0 < found.likeness < ALIKE
-    assert found.signal is None and not found.findings
+    for seed, size in ((14, 0.018), (15, 0.018), (13, 0.008)):
+        jumps = size * np.random.default_rng(seed).standard_normal((2, N_EPOCHS, 2))
+        shifted = recorded(pair, jumps[obs.camera, obs.epoch], seed)
+        found = diagnose(replace(shifted, model=known))
+        assert not found.findings
+        if size == 0.018:
+            assert found.signal is not None and found.signal.whole
+            off = found.signal.size_rad - size / 1100.0
+            assert np.abs(off).max() < 4.0 * found.signal.size_stds_rad.max()
+        else:
+            # A fortieth of it is what a readout may give all marks of an image.
+            assert found.signal is None and found.likeness < ALIKE
 
 
 def test_what_lasts_is_no_haze(pair):
