@@ -121,10 +121,10 @@ class _Samples:
 
 def _behind(a: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Rows behind 1 / A(q), from rest."""
-    # Half a second of imports that only who fits such models has to wait for.
+    # A third of a second of imports, for which only who fits such models has to wait.
     from scipy.signal import lfilter
 
-    return lfilter([1.0], np.append(1.0, a), rows, axis=-1)
+    return np.asarray(lfilter([1.0], np.append(1.0, a), rows, axis=-1))
 
 
 def is_even(time: Float[np.ndarray, " epochs"]) -> bool:
