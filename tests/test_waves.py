@@ -256,7 +256,7 @@ def test_what_neighbours_share_a_little_is_haze_where_it_falls_off(pair):
     known = replace(pair.model, targets=(replace(pair.model.targets[0], free=()),))
     change = turbulent(pair, 0.018, 250.0, 0.0, 12)
     found = diagnose(replace(recorded(pair, change), model=known))
-    assert 0.08 < found.likeness < 0.15
+    assert ALIKE < found.likeness < 0.15
     assert found.signal is not None and not found.signal.whole
     assert np.abs(found.signal.size_rad - 0.018 / 1100.0).max() < 4.0 * (
         found.signal.size_stds_rad.max()

@@ -24,7 +24,7 @@ from jaxvm.physics.catalogue.entry import each
 ALIKE = 0.08
 """Correlation of neighbouring marks of one image from which what is left is no noise of marks.
 
-What a readout gives all marks of an image is a few percent of their noise.
+What a readout gives all marks of an image is taken to be a few percent of their noise at most.
 """
 
 MOST_IMAGES = 400

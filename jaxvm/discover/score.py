@@ -158,7 +158,7 @@ class ScoreTests:
 
     def _batches(self) -> Iterator[list[tuple[int, int]]]:
         """Groups by family and number, so many that they have about `_STACKED` terms, or fewer."""
-        most = min(_STACKED, _AT_ONCE // self.arrangement.cells.residual.size)
+        most = min(_STACKED, _AT_ONCE // max(self.arrangement.cells.residual.size, 1))
         own, terms = [], 0
         for number, family in enumerate(self.battery.families):
             for g in range(len(family.groups)):
