@@ -236,6 +236,8 @@ def separate_by(finding: Finding) -> str:
     """The recording that would part it from its doubles, the catalogue's where none would."""
     entries = finding.hypothesis.entries
     other = entries[0].separate_by if entries else "another driver's range, another geometry"
+    if not finding.rivals:
+        return f"{other} (by the catalogue)"
     if not finding.advice:
         return f"{other} (by the catalogue: these doubles are other names of it, or contain it)"
     best = finding.advice[0]
