@@ -91,6 +91,30 @@ def test_drops_are_those_of_dense_projections(stereo, ranked):
     assert {"constant", "time", "ambient_degC", OWN_BODY} <= compared
 
 
+def test_many_vectors_are_scored_as_one_after_the_other(stereo):
+    """Of all hypotheses, information known or not, and at a fit whose information has a border."""
+    tests = ScoreTests.of(stereo, enumerate_hypotheses(stereo.scene))
+    shape = len(tests.arrangement.drivers), tests.arrangement.components
+    drawn = np.random.default_rng(5).normal(size=(3, *shape))
+    focal = Effect(
+        "", (Term("sensor.focal"),), "ambient_degC", "linear", (), 20.0, Scope(), (0.0,)
+    )
+    beside = adjust(stereo.scene.with_effects((focal,)))
+    for own in (tests, tests, tests.at(beside)):
+        many = own.score_many(1.0, drawn)
+        for vector, ranking in zip(drawn, many, strict=True):
+            alone = own.score(1.0, residual=vector)
+            assert ranking.n == alone.n > 100
+            for one, other in zip(ranking.scores, alone.scores, strict=True):
+                np.testing.assert_allclose(one.drop, other.drop, rtol=1e-6, atol=1e-6)
+                np.testing.assert_array_equal(one.valid, other.valid)
+                # What is nearly absorbed has amplitudes of rounding.
+                size = np.abs(other.amplitude).max(axis=-1, keepdims=True)
+                close = np.abs(one.amplitude - other.amplitude) <= 1e-4 * size
+                assert close[other.seen > 1e-4].all()
+    tests.score(1.0)  # the information of the border was not taken for that of a vector
+
+
 def test_maps_are_scored_as_by_dense_matrices(stereo, monkeypatch):
     """Few terms and many, with products within groups and without, against M G itself."""
     families = [f for f in enumerate_hypotheses(stereo.scene) if f.n_terms > 8]

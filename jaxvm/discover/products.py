@@ -209,8 +209,9 @@ class Information:
         return replace(left, shared=np.concatenate([self.shared, taken], axis=2))
 
 
-def drop_of(known: Information, part: Part, product: np.ndarray):
-    """Drop of chi-square [b] and one-step amplitudes [b, columns]."""
-    score = summed(part, at_cells(product, part.place.cells))
-    score = np.einsum("bdc,bc->bd", known.whitener, score)
-    return np.sum(score**2, axis=1), -np.einsum("bdc,bd->bc", known.whitener, score)
+def drop_of(
+    known: Information, part: Part, product: Float[np.ndarray, "cells terms vectors"]
+) -> tuple[Float[np.ndarray, "b vectors"], Float[np.ndarray, "b columns vectors"]]:
+    """Drops of chi-square and one-step amplitudes, by each of the vectors."""
+    score = known.whitener @ summed(part, at_cells(product, part.place.cells))
+    return np.sum(score**2, axis=1), -np.swapaxes(known.whitener, 1, 2) @ score

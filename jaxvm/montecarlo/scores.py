@@ -1,6 +1,7 @@
 """Monte Carlo of a diagnosis' score: how hypotheses look in noise, alone or on hidden physics.
 
-One trial has as many scores as there are hypotheses, so trials run one by one.
+The scores of many trials are computed together: the tangents of hypotheses, which are the same
+in all of them, are read once and multiplied with the residuals of all.
 """
 
 from typing import Any
@@ -10,10 +11,14 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxvm.discover.hypotheses import Family
+from jaxvm.discover.ranking import Ranking
 from jaxvm.discover.score import ScoreTests
-from jaxvm.montecarlo.trials import OneByOne, Trial, fingerprint, name_of
+from jaxvm.montecarlo.trials import Together, Trial, fingerprint, name_of
 from jaxvm.network.draw import Noise
 from jaxvm.solve.adjust import Adjustment
+
+_TOGETHER, _AT_ONCE = 32, 8_000_000
+"""Trials of a batch, more are hardly faster; and numbers in their residuals and scores (64 MB)."""
 
 
 def score_study(
@@ -22,7 +27,7 @@ def score_study(
     hidden: Float[np.ndarray, "observations components"] | None = None,
     noise: Noise = jax.random.normal,
     told: dict[str, Any] | None = None,
-) -> OneByOne:
+) -> Together:
     """The study of the scores of hypotheses at a fit, against residuals that are drawn anew.
 
     A trial gives the largest drop of chi-square (`drop`), its surprise in standard deviations
@@ -47,17 +52,28 @@ def score_study(
     measured = fit.scene.recording.observations.pixel
     about |= {"numbers": fingerprint((measured, hidden, noise))} | (told or {})
 
-    def trial(key) -> Trial:
-        residual = np.asarray(noise(key, shape))
-        if hidden is not None:
-            residual = residual + hidden
-        scores = tests.score(1.0, residual=residual).scores
-        z = [np.where(own.valid, own.z, -np.inf) for own in scores]
-        family = int(np.argmax([own.max(initial=-np.inf) for own in z]))
-        best = int(np.argmax(z[family]))
-        return Trial(
-            error={"drop": scores[family].drop.ravel()[best], "z": z[family].ravel()[best]},
-            noted={"family": family, "hypothesis": best},
-        )
+    @jax.jit
+    def drawn(keys):
+        return jax.vmap(lambda key: noise(key, shape))(keys)
 
-    return OneByOne(trial, about, failures=())
+    def trials(keys) -> Trial:
+        residuals = np.asarray(drawn(keys))
+        if hidden is not None:
+            residuals = residuals + hidden
+        largest = [_largest(ranking) for ranking in tests.score_many(1.0, residuals)]
+        return jax.tree.map(lambda *parts: np.stack(parts), *largest)
+
+    numbers = np.prod(shape) + tests.battery.n_columns
+    return Together(trials, about, together=int(np.clip(_AT_ONCE // numbers, 1, _TOGETHER)))
+
+
+def _largest(ranking: Ranking) -> Trial:
+    """What looks most like something in one trial."""
+    z = [np.where(own.valid, own.z, -np.inf) for own in ranking.scores]
+    family = int(np.argmax([own.max(initial=-np.inf) for own in z]))
+    best = int(np.argmax(z[family]))
+    drop = ranking.scores[family].drop.ravel()[best]
+    return Trial(
+        error={"drop": drop, "z": z[family].ravel()[best]},
+        noted={"family": np.array(family), "hypothesis": np.array(best)},
+    )

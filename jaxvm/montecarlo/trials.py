@@ -1,12 +1,14 @@
 """Trials: what a Monte Carlo study does again and again, as a pure function of a random key.
 
 A study draws a truth and measurements, estimates, and compares. One that JAX can trace is computed
-in batches under `vmap` on all devices (`Traced`); any other function of a key is called for one
-trial after the other (`OneByOne`).
+in batches under `vmap` on all devices (`Traced`). Others run on the host: of one that computes many
+trials together (`Together`), or any function of a key, called for one trial after the other
+(`OneByOne`).
 """
 
 import hashlib
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import equinox as eqx
@@ -155,6 +157,29 @@ def _sound(found: Any) -> Trial:
             raise ValueError(f'"{name}" of a trial is an array of shape {value.shape}, no number')
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(e)) for e in flat.values()]))
     return Trial(flat, jnp.asarray(found.converged) & finite, sigma, noted)
+
+
+class Together:
+    """A study of a function that computes many trials together, on the host.
+
+    Attributes:
+        trials: from the keys of some trials to these trials, stacked.
+        told: what it is, for a file.
+        together: trials of a batch, unless it is given.
+    """
+
+    def __init__(
+        self, trials: Callable[[PRNGKeyArray], Trial], told: dict[str, Any], together: int
+    ):
+        self.trials, self.told, self.together = trials, told, together
+
+    def about(self) -> dict[str, Any]:
+        return self.told
+
+    def batch(self, key, numbers, mesh=None) -> Trial:
+        del mesh
+        found = self.trials(jax.vmap(partial(jax.random.fold_in, key))(numbers))
+        return jax.tree.map(np.asarray, jax.vmap(_sound)(found))
 
 
 class OneByOne:
