@@ -30,7 +30,7 @@ from jaxvm.identify.trajectories import (
     trajectories,
 )
 from jaxvm.montecarlo import run
-from jaxvm.montecarlo.drift import compensation_study
+from jaxvm.montecarlo.drift import compensation_study, structure_study
 from jaxvm.network.residual import residual
 from jaxvm.network.scene import build
 from jaxvm.physics.drivers import POWER_ON
@@ -296,6 +296,16 @@ def test_a_study_of_compensation_under_noise():
     assert (left < 0.1 * before).all() and left[0] != left[1]
     with pytest.raises(ValueError, match="drifts do not fit"):
         compensation_study(*days, drift[:-1])
+    # The same noise, learnt by the one adjustment that ends the identification, in batches.
+    together = run(structure_study(*days, drift, CONTINUOUS[2]), 0, 20)
+    assert together.failed == 0 and together.names == found.names
+    for name, column in together.columns.items():
+        if name in found.columns and name.startswith(("error", "before")):
+            np.testing.assert_allclose(column[:2], found.columns[name], rtol=0.02, atol=1e-5)
+    with pytest.raises(ValueError, match="static, parabola.* compensation_study"):
+        structure_study(*days, drift, CONTINUOUS[1])
+    with pytest.raises(ValueError, match="drifts do not fit"):
+        structure_study(*days, drift[:-1], CONTINUOUS[2])
 
 
 def test_a_model_survives_its_file(identified, tmp_path):

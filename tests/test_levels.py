@@ -126,7 +126,7 @@ def test_trials_are_those_of_the_arrow(chain, estimator, monkeypatch):
         return network_study(chain, quantity, estimator=estimator)
 
     found = run(study(), 0, 40, batch=20)
-    monkeypatch.setattr(networks, "in_levels", lambda problem: problem)
+    monkeypatch.setattr(networks, "specialised", lambda problem: problem)
     plain = run(study(), 0, 40, batch=20)
     assert found.failed == plain.failed == 0
     np.testing.assert_allclose(found.errors, plain.errors, atol=1e-5 * plain.errors.std())

@@ -472,6 +472,13 @@ def test_the_pace_grows_while_that_pays():
     assert short.batch == 64 and short.found
 
 
+def test_trials_with_many_numbers_begin_with_few():
+    assert Pace(None, own_bytes=50_000).batch == 64
+    assert Pace(None, own_bytes=4_000_000).batch == 4
+    assert Pace(None, own_bytes=10**15).batch == 1
+    assert Pace(100, own_bytes=4_000_000).batch == 100
+
+
 def test_a_batch_on_an_accelerator_is_large_at_once(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert Pace(None, trials=100_000).batch == 4096

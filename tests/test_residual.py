@@ -389,6 +389,37 @@ def test_blocks_are_the_whole_table(exact):
             np.testing.assert_allclose(a[used], b[used], rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.parametrize("tangent", [False, True])
+def test_a_program_of_its_own_is_the_whole_table(stereo, tangent):
+    """What is known of the effects before a program is traced leaves out what changes nothing."""
+    _, scene = stereo
+    scope = Scope(camera=("left",))
+    terms = Term("sensor.focal"), Term("mount.turn_y"), Term("target.disc", "one", weight=1e-3)
+    effects = (
+        Effect("lag", terms[:2], "time", "lag with state", (0.7,), 0.1, scope, (2e-4, 0, 1e-4, 0)),
+        Effect("again", terms[1:], "time", "lag", (0.7,), 0.1, Scope(), (2e-4, 0.5), shares="lag"),
+        Effect("whole", (Term("lens.k1"),), "constant", "constant", amplitudes=(1e-3,)),
+    )
+    scene = scene.with_effects(effects)
+    network, flat = scene.network, scene.state.flatten()
+    own = replace(network, effects=network.effects.specialised())
+    known = own.effects.known
+    assert len(known.fed) == 4 and len(set(known.course)) == 4 < network.effects.n_columns
+    amplitudes, constants = (len(network.layout.all(f)) for f in ("amplitude", "constant"))
+    for factor in network.pixels:
+        live = tuple(range(factor.slots.shape[1] + amplitudes + constants - 1))
+        find = eqx.filter_jit(linearised)
+        some, every = (find(factor, net, flat, live, tangent) for net in (own, network))
+        used = np.asarray(factor.weight) > 0.0
+        for a, b in zip(some[: 2 + tangent], every, strict=False):
+            np.testing.assert_allclose(a[used], b[used], rtol=1e-9, atol=1e-9)
+        fed = np.array(known.fed)
+        np.testing.assert_allclose(some[2][used][..., fed], every[2][used][..., fed], rtol=1e-9)
+    some, every = (eqx.filter_jit(residual)(scene.state, net) for net in (own, network))
+    for a, b in zip(jax.tree.leaves(some), jax.tree.leaves(every), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
+
+
 @pytest.mark.parametrize("port", ["", "sensor.focal", "target.disc"])
 def test_blocks_leave_out_what_nothing_feeds(exact, port):
     """One program under `jit` computes all ports and all rows; blocks only what counts."""

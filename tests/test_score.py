@@ -96,9 +96,7 @@ def test_many_vectors_are_scored_as_one_after_the_other(stereo):
     tests = ScoreTests.of(stereo, enumerate_hypotheses(stereo.scene))
     shape = len(tests.arrangement.drivers), tests.arrangement.components
     drawn = np.random.default_rng(5).normal(size=(3, *shape))
-    focal = Effect(
-        "", (Term("sensor.focal"),), "ambient_degC", "linear", (), 20.0, Scope(), (0.0,)
-    )
+    focal = Effect("", (Term("sensor.focal"),), "ambient_degC", "linear", (), 20.0, Scope(), (0.0,))
     beside = adjust(stereo.scene.with_effects((focal,)))
     for own in (tests, tests, tests.at(beside)):
         many = own.score_many(1.0, drawn)

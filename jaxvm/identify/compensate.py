@@ -119,6 +119,11 @@ def compensate(
 
 def moved(camera: Camera, drift: CameraDrift, pixel, depth, ports) -> np.ndarray:
     """Displacement (px) of pixels by changes of ports, row by row."""
+    return np.einsum("ncp,np->nc", moves(camera, drift, pixel, depth), ports)
+
+
+def moves(camera: Camera, drift: CameraDrift, pixel, depth) -> Float[np.ndarray, "n 2 ports"]:
+    """Displacement (px) of pixels by a unit of each port that a model has."""
     if camera.focal_px is None:
         raise ValueError(
             f'camera "{camera.name}" has no focal_px; calibrate it first (jaxvm adjust), and '
@@ -132,8 +137,7 @@ def moved(camera: Camera, drift: CameraDrift, pixel, depth, ports) -> np.ndarray
         camera.lens, jnp.asarray(camera.focal_px, float), jnp.asarray(centre, float),
         jnp.asarray(coefficients, float), jnp.asarray(pixel, float), jnp.asarray(depth, float),
     )  # fmt: skip
-    own = np.asarray(columns)[:, :, [PORT_INDEX[port] for port in drift.ports]]
-    return np.einsum("ncp,np->nc", own, ports)
+    return np.asarray(columns)[:, :, [PORT_INDEX[port] for port in drift.ports]]
 
 
 @eqx.filter_jit

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxvm.identify.gains import SLOWEST, Fit, foretold_density, gains_at, prior_widths
 from jaxvm.identify.inputs import Inputs, are_power
@@ -112,20 +112,29 @@ def regressors(
     inputs: Inputs, reference, structure: Structure, tau, delay: float
 ) -> Float[np.ndarray, "epochs regressors"]:
     """Regressors at the epochs: every input at once, its square, and behind every lag."""
-    data = _padded(inputs, np.asarray(reference))
-    found = _regressors(data, jnp.asarray(tau, float), jnp.asarray(delay, float), structure.power)
+    data = padded(inputs, np.asarray(reference))
+    found = regressors_at(data, jnp.asarray(tau, float), jnp.asarray(delay, float), structure.power)
     return np.asarray(found)[: len(inputs.epoch)]
 
 
-class _Data(eqx.Module):
-    time: Array
-    x: Array
-    power: Array  # 1 where an input is the time since a power-on
-    epoch: Array
+class Padded(eqx.Module):
+    """Inputs with spare samples, so that a log of another length is no other program.
+
+    Attributes:
+        time: grid of times (s).
+        x: inputs, less their references.
+        power: whether an input is the time since a power-on.
+        epoch: place of every epoch on the grid; the last one again and again in the padding.
+    """
+
+    time: Float[Array, " times"]
+    x: Float[Array, "inputs times"]
+    power: Bool[Array, " inputs"]
+    epoch: Int[Array, " epochs"]
 
 
-def _padded(inputs: Inputs, reference: np.ndarray) -> _Data:
-    """Inputs with spare samples, so that a log of another length is no other program."""
+def padded(inputs: Inputs, reference: Float[np.ndarray, " inputs"]) -> Padded:
+    """Inputs as a traced program takes them."""
     time, x = inputs.time, inputs.values
     power = are_power(inputs.names)
     x = np.where(power[:, None], x, x - reference[:, None])
@@ -135,11 +144,14 @@ def _padded(inputs: Inputs, reference: np.ndarray) -> _Data:
     x = np.concatenate([x, np.repeat(x[:, -1:], spare, axis=1)], axis=1)
     n = rounded(len(inputs.epoch))
     epoch = np.append(inputs.epoch, np.full(n - len(inputs.epoch), inputs.epoch[-1]))
-    return _Data(jnp.asarray(time), jnp.asarray(x), jnp.asarray(power), jnp.asarray(epoch))
+    return Padded(jnp.asarray(time), jnp.asarray(x), jnp.asarray(power), jnp.asarray(epoch))
 
 
 @partial(jax.jit, static_argnames="power")
-def _regressors(data: _Data, tau, delay, power: int) -> Float[Array, "epochs regressors"]:
+def regressors_at(
+    data: Padded, tau: Float[Array, " order"], delay: Float[Array, ""], power: int
+) -> Float[Array, "epochs regressors"]:
+    """Regressors of padded inputs, differentiable by time constants and delay."""
     late = data.time - delay
 
     def course(x, is_power):
@@ -179,7 +191,7 @@ def fit(
         large: what a large drift is; gains have priors of this size.
     """
     reference = inputs.reference
-    data = _padded(inputs, reference)
+    data = padded(inputs, reference)
     n, spare = len(output), len(data.epoch) - len(output)
     pad = ((0, spare), (0, 0))
     z = jnp.asarray(np.pad(output, pad))
@@ -233,11 +245,11 @@ def _constants(theta, order: int, bounds, step):
     return tau, _LATEST * step * jnp.tanh(theta[-1])
 
 
-def _design(theta, data: _Data, bounds, step, shape):
+def _design(theta, data: Padded, bounds, step, shape):
     """Mean, regressors, and the states at the first epoch."""
     order, power, delayed = shape
     tau, delay = _constants(theta, order, bounds, step)
-    found = _regressors(data, tau, delay if delayed else 0.0, power)
+    found = regressors_at(data, tau, delay if delayed else 0.0, power)
     since = data.time[data.epoch] - data.time[data.epoch[0]]
     states = jnp.exp(-since[:, None] / tau) if order else jnp.zeros((len(since), 0))
     return jnp.concatenate([jnp.ones((len(since), 1)), found, states], axis=1)

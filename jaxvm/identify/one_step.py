@@ -6,17 +6,18 @@ pixels. Lags of one camera share their time constants; means, and the states tha
 are nuisance effects and are dropped afterwards.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxvm.identify.gains import LOOSE
 from jaxvm.identify.inputs import Inputs
 from jaxvm.identify.lags import Lags, regressors
 from jaxvm.identify.model import CameraDrift
 from jaxvm.identify.trajectories import CAMERA_PORTS
-from jaxvm.network.scene import build
+from jaxvm.network.scene import Scene, build
+from jaxvm.network.state import State
 from jaxvm.physics.drivers import POWER_ON
 from jaxvm.physics.effects import Effect, Scope, Term
 from jaxvm.recording import Drivers, Recording
@@ -37,29 +38,33 @@ def refined(plain: Adjustment, drifts: list[CameraDrift], inputs: Inputs) -> lis
     Models in discrete time, and static parabolas, are no effects of the network; they stay as they
     are.
     """
-    chosen = [d for d in drifts if isinstance(d.dynamics, Lags) and d.dynamics.structure.power == 1]
-    if not chosen:
+    if not any(map(is_effects, drifts)):
         return drifts
-    recording = plain.scene.recording
-    effects: list[Effect] = []
-    for drift in chosen:
+    found = adjusted(plain, drifts, inputs)
+    if found.failed:
+        return drifts
+    deviations = standard_deviations(found, found.unit_variance)
+    return [
+        _read_back(drift, inputs, found.scene, deviations) if is_effects(drift) else drift
+        for drift in drifts
+    ]
+
+
+def is_effects(drift: CameraDrift) -> bool:
+    """Whether a drift model is a list of effects."""
+    return isinstance(drift.dynamics, Lags) and drift.dynamics.structure.power == 1
+
+
+def adjusted(plain: Adjustment, drifts: list[CameraDrift], inputs: Inputs) -> Adjustment:
+    """Adjustment of a scene together with the drift models that are effects, begun at these."""
+    recording, effects = plain.scene.recording, list[Effect]()
+    for drift in filter(is_effects, drifts):
         assert isinstance(drift.dynamics, Lags)
         recording = _with_late_channels(recording, drift.dynamics)
         effects += _effects(drift, inputs.only(drift.dynamics.inputs).ranges())
     scene = replace(build(recording, ()), state=plain.scene.state)
     scene = scene.with_effects((*recording.model.effects, *effects))
-    found = adjust(scene, rtol=_RTOL, check=False, repeats=0)
-    if found.failed:
-        return drifts
-    deviations = standard_deviations(found, found.unit_variance)
-    sigma = np.asarray(deviations.amplitude), np.asarray(deviations.constant)
-    names = [effect.name for effect in found.scene.effects]
-    fitted = dict(zip(names, found.scene.fitted_effects(), strict=True))
-    places = dict(zip(names, found.scene.places(), strict=True))
-    better = {}
-    for drift in chosen:
-        better[drift.camera] = _read_back(drift, inputs, fitted, places, sigma)
-    return [better.get(drift.camera, drift) for drift in drifts]
+    return adjust(scene, rtol=_RTOL, check=False, repeats=0)
 
 
 def _late(name: str, delay: float) -> str:
@@ -119,24 +124,49 @@ def _effects(drift: CameraDrift, ranges: Float[np.ndarray, " inputs"]) -> list[E
     return found
 
 
-def _read_back(drift: CameraDrift, inputs: Inputs, fitted, places, sigma) -> CameraDrift:
-    model = drift.dynamics
+@dataclass(frozen=True)
+class Places:
+    """Where the gains and time constants of a drift model are in the state of a scene.
+
+    Attributes:
+        gain: places among the amplitudes [ports, regressors].
+        tau: places among the constants.
+        size: of a unit of an amplitude in each port's unit.
+    """
+
+    gain: Int[np.ndarray, "ports regressors"]
+    tau: Int[np.ndarray, " order"]
+    size: Float[np.ndarray, " ports"]
+
+    @classmethod
+    def of(cls, drift: CameraDrift, scene: Scene) -> "Places":
+        """Of a model that is among the effects of a scene (`adjusted`)."""
+        model = drift.dynamics
+        assert isinstance(model, Lags)
+        own = {e.name: (e, *at) for e, at in zip(scene.effects, scene.places(), strict=True)}
+        names = [f"{drift.camera}: {name}" for name in model.inputs]
+        lagged = [f"{drift.camera}: {name}, lag {k + 1}" for k in range(len(model.tau))
+                  for name in model.inputs]  # fmt: skip
+        gain = []
+        for effect, columns, _ in (own[name] for name in names + lagged):
+            # Of every port the first basis; the second is a state.
+            every = 2 if effect.form == "lag with state" else 1
+            gain.append(np.arange(columns.start, columns.stop, every))
+        tau = [own[name][2].start for name in lagged[:: len(model.inputs)]]
+        size = np.array([CAMERA_PORTS[port] for port in drift.ports])
+        return cls(np.stack(gain, axis=1), np.array(tau, int), size)
+
+
+def _read_back(drift: CameraDrift, inputs: Inputs, scene: Scene, deviations: State) -> CameraDrift:
+    model, at = drift.dynamics, Places.of(drift, scene)
     assert isinstance(model, Lags)
-    names = [f"{drift.camera}: {name}" for name in model.inputs]
-    lagged = [f"{drift.camera}: {name}, lag {k + 1}" for k in range(len(model.tau))
-              for name in model.inputs]  # fmt: skip
-    names += lagged
-    heads = lagged[:: len(model.inputs)]
 
-    def first_of(name: str, values) -> np.ndarray:
-        """Values of the first basis of every port; the second is a state."""
-        every = 2 if fitted[name].form == "lag with state" else 1
-        return np.asarray(values)[::every] * [CAMERA_PORTS[port] for port in drift.ports]
+    def values(state: State) -> tuple[np.ndarray, np.ndarray]:
+        gain = np.asarray(state.amplitude)[at.gain] * at.size[:, None]
+        return gain, np.asarray(state.constant)[at.tau]
 
-    gain = np.array([first_of(name, fitted[name].amplitudes) for name in names]).T
-    spread = np.array([first_of(name, sigma[0][places[name][0]]) for name in names]).T
-    tau = np.array([fitted[name].constants[0] for name in heads])
-    tau_sigma = np.array([sigma[1][places[name][1]][0] for name in heads])
+    gain, tau = values(scene.state)
+    spread, tau_sigma = values(deviations)
     order = np.argsort(tau)
     m = len(model.inputs)
     columns = np.concatenate([np.arange(m), *(m + m * k + np.arange(m) for k in order)]).astype(int)

@@ -37,11 +37,12 @@ Estimator = Callable[[Problem, PRNGKeyArray], Estimate]
 class GaussNewton(eqx.Module):
     """Full steps until no unknown would move any more: for starts at or near the truth.
 
-    The next step is foretold from the last two, which shrink by at least the same factor again.
+    The length of a step s is sqrt(s^T H s), the Newton decrement (Boyd and Vandenberghe 2004, sec.
+    9.5.1): no combination of unknowns moves by more of its standard deviations. The next one is
+    foretold from the last two, which shrink by at least the same factor again.
 
     Attributes:
-        settled: change of a unit-diagonal unknown at which it has converged. Rounding moves weak
-            combinations by as much as 1e-7 where the condition number is 1e8.
+        settled: length of a step (standard deviations) below which it has converged.
         most: bound on steps.
     """
 
@@ -53,7 +54,7 @@ class GaussNewton(eqx.Module):
             x, before, _, k = state
             normal = problem.normal(x)
             change = -normal.hessian.factorised().solve(normal.gradient)
-            size = jnp.max(jnp.abs(change))
+            size = jnp.sqrt(jnp.maximum(-change @ normal.gradient, 0.0))
             return x + change, size, size * jnp.minimum(size / before, 1.0), k + 1
 
         def going(state):

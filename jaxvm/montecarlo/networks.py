@@ -29,7 +29,7 @@ from jaxvm.solve.adjust import degrees_of_freedom
 from jaxvm.solve.arrow import Arrow, factorise
 from jaxvm.solve.gauge import check_gauge
 from jaxvm.solve.large import is_large
-from jaxvm.solve.problem import Problem, in_levels, normal_at, scaled, scene_problem
+from jaxvm.solve.problem import Problem, normal_at, scaled, scene_problem, specialised
 from jaxvm.solve.robust import Loss
 
 Quantity = Callable[[State], Float[Array, "..."] | Mapping[str, Float[Array, "..."]]]
@@ -138,7 +138,7 @@ def network_study(
     _, in_parts = ravel_pytree(named(quantity(problem.state(jnp.zeros(problem.n)))))
     sigma = in_parts(jnp.asarray(np.sqrt(np.diagonal(covariance))))
     source = None if world is None else (world.network, world.state)
-    problem = in_levels(problem)
+    problem = specialised(problem)
     trial = NetworkTrial(problem, quantity, estimator, noise, truth, source, sigma)
     about = {"kind": "network", "noise": name_of(noise), "estimator": name_of(estimator)}
     about["model"] = _model_text(scene)

@@ -2,7 +2,7 @@
 
 Whether a batch fits the cache depends on the machine and on the program; so larger and larger ones
 are tried until they gain nothing more, where what is left to do pays for compiling them and memory
-holds them.
+holds them. The first is the smaller, the more numbers a trial has.
 """
 
 import resource
@@ -13,6 +13,10 @@ import jax
 _FIRST, _FACTOR = 64, 4
 _FIRST_ON_ACCELERATORS = 4096
 """A batch of an accelerator takes as long as one of a single trial until it is full."""
+
+_CACHED, _SHARE_OF_ROOM = 16e6, 0.02
+"""Bytes of a study's own numbers, times the trials of its first batch: what a processor's cache
+holds, and a share of the memory that is free, for what trials compute is many times as much."""
 
 _LARGEST = 1 << 16
 _GAIN = 1.05
@@ -30,11 +34,17 @@ class Pace:
         found: whether it stays what it is.
     """
 
-    def __init__(self, batch: int | None, devices: int = 1, trials: int = _LARGEST):
-        """`batch` fixes it; None lets it be found."""
+    def __init__(
+        self, batch: int | None, devices: int = 1, trials: int = _LARGEST, own_bytes: int = 0
+    ):
+        """`batch` fixes it; None lets it be found, with so many bytes of numbers for each trial."""
         self._devices = devices
         self.found = batch is not None
-        begin = _FIRST if jax.default_backend() == "cpu" else _FIRST_ON_ACCELERATORS
+        on_host = jax.default_backend() == "cpu"
+        begin = _FIRST if on_host else _FIRST_ON_ACCELERATORS
+        bound = min(_SHARE_OF_ROOM * _room(), _CACHED if on_host else float("inf"))
+        if own_bytes * begin > bound:
+            begin = max(int(bound / own_bytes), 1)
         first = min(begin * devices, max(trials, 1))
         self.batch = self._whole(first if batch is None else batch)
         self._seconds: dict[int, float] = {}  # of a trial, the best of each size

@@ -111,7 +111,8 @@ def run(
     if batch is None:
         batch = getattr(study, "together", known if known <= len(left) else None)
     measured = batch is None
-    pace = Pace(batch, 1 if mesh is None else mesh.size, len(left))
+    devices = 1 if mesh is None else mesh.size
+    pace = Pace(batch, devices, len(left), getattr(study, "own_bytes", 0))
     # A processor works at several batches at a time: none keeps all of its cores busy.
     cores = os.cpu_count() or 1 if mesh is None and isinstance(study, Traced) and _on_host() else 1
     began, compiled, so_far = time.perf_counter(), compile_seconds(), gathered.done

@@ -66,6 +66,11 @@ class Traced(eqx.Module):
     def about(self) -> dict[str, Any]:
         return self.told | ({"precision": "float32"} if self.single else {})
 
+    @property
+    def own_bytes(self) -> int:
+        """Bytes of the numbers that every trial reads."""
+        return sum(leaf.nbytes for leaf in jax.tree.leaves(eqx.filter(self.trial, eqx.is_array)))
+
     def in_single_precision(self) -> "Traced":
         """The same study in float32, for accelerators that are many times as fast in it.
 

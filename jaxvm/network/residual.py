@@ -20,8 +20,8 @@ from jaxvm.network.network import Network, Residuals
 from jaxvm.network.state import State
 from jaxvm.network.tiles import Tiles
 from jaxvm.physics.blocks import by_blocks, hosted, roomy, whole
-from jaxvm.physics.effects import EffectTable, course_slopes, courses
-from jaxvm.physics.ports import DEAR, N_PORTS, PORT_INDEX, PortValues
+from jaxvm.physics.effects import EffectTable, Known, course_slopes, courses
+from jaxvm.physics.ports import ALL_PORTS, CHEAP_PORTS, DEAR, N_PORTS, PORT_INDEX, PortValues
 
 
 def residual(state: State, network: Network) -> Residuals:
@@ -102,8 +102,8 @@ def rows(
     fed = _fed(factor, network)
     ports = None
     if fed.any and isinstance(factor, PixelFactor | RangeFactor):
-        ports = _ports(factor, _acting(network, at), only)
-    return _chained(partial(_values, dear=fed.dear), factor, at, ports, only)
+        ports = _ports(factor, network.effects, _acting(network, at), only)
+    return _chained(partial(_values, fed=fed.ports), factor, at, ports, only)
 
 
 def _used(factor: Factor) -> np.ndarray | None:
@@ -125,22 +125,27 @@ def _chained(function, factor: Factor, at: Present, ports, only):
 
 
 class Fed(NamedTuple):
-    """Whether effects may act on a table at all, and through the dear port."""
+    """Whether effects may act on a table at all, and through which ports."""
 
     any: bool
-    dear: bool
+    ports: tuple[int, ...]
 
 
 def _fed(factor: Factor, network: Network) -> Fed:
-    """As far as it is known before anything is computed: mere room for effects costs nothing."""
-    ports = network.effects.ports
+    """As far as it is known before anything is computed: mere room for effects costs nothing.
+
+    Few sets of ports are few programs: that of all, and that of all but the dear one.
+    """
+    table = network.effects
     if not isinstance(factor, PixelFactor | RangeFactor):
-        return Fed(False, False)
-    if whole(ports):
-        return Fed(ports.shape[0] > 0, ports.shape[0] > 0 and isinstance(factor, PixelFactor))
-    ports = np.asarray(ports)
-    dear = ports[:, PORT_INDEX[DEAR]].any() and isinstance(factor, PixelFactor)
-    return Fed(bool(ports.any()), bool(dear))
+        return Fed(False, ())
+    if table.known is not None:
+        return Fed(bool(table.known.fed), table.known.fed)
+    every = ALL_PORTS if isinstance(factor, PixelFactor) else CHEAP_PORTS
+    if whole(table.ports):
+        return Fed(table.ports.shape[0] > 0, every)
+    ports = np.asarray(table.ports)
+    return Fed(bool(ports.any()), every if ports[:, PORT_INDEX[DEAR]].any() else CHEAP_PORTS)
 
 
 class Acting(NamedTuple):
@@ -227,11 +232,11 @@ def _by_numbers(function, factor: Factor, shared, ports) -> Any:
 
 
 @program
-def _values(table, shared, dear: bool) -> Float[Array, "observations components"]:
+def _values(table, shared, fed: tuple[int, ...]) -> Float[Array, "observations components"]:
     factor, ports = table
 
     def local(own, ports, data):
-        return factor.local(list(map(_still, own)), data, PortValues(ports, dear))
+        return factor.local(list(map(_still, own)), data, PortValues(ports, fed))
 
     return _by_rows(local, factor, shared, ports)
 
@@ -241,16 +246,24 @@ def _still(part):
 
 
 def _ports(
-    factor: PixelFactor | RangeFactor, acting: Acting, only: np.ndarray | None
+    factor: PixelFactor | RangeFactor,
+    effects: EffectTable,
+    acting: Acting,
+    only: np.ndarray | None,
 ) -> Float[Array, "observations ports"]:
     """Port values of each observation: what all effects together do to it."""
-    return by_blocks(_port_values, (factor.view, factor.pattern), acting, only=only)
+    values = partial(_port_values, known=effects.known)
+    return by_blocks(values, (factor.view, factor.pattern), acting, only=only)
 
 
 @program
-def _port_values(table, acting: Acting):
+def _port_values(table, acting: Acting, known: Known | None):
     view, pattern = table
-    return (acting.amplitude * acting.value.T[view] * pattern) @ acting.ports
+    each = acting.amplitude * acting.value.T[view] * pattern
+    if known is None:
+        return each @ acting.ports
+    fed = np.array(known.fed, int)
+    return jnp.zeros((len(each), N_PORTS)).at[:, fed].set(each @ acting.ports[:, fed])
 
 
 class Linearised(NamedTuple):
@@ -281,13 +294,14 @@ def linearise(
     ports = None
     if isinstance(factor, PixelFactor | RangeFactor):
         if fed.any:
-            ports = _ports(factor, acting, only)
+            ports = _ports(factor, network.effects, acting, only)
         elif tangent:
             ports = np.zeros((factor.slots.shape[0], N_PORTS))
     own = tuple(at for at in live if at < n_own)
-    derivatives = partial(_derivatives, live=own, dear=fed.dear)
+    through = tuple(sorted({*fed.ports, *CHEAP_PORTS})) if tangent else fed.ports
+    derivatives = partial(_derivatives, live=own, fed=through)
     value, by_own, by_ports = _chained(derivatives, factor, at, ports, only)
-    if tangent and isinstance(factor, PixelFactor) and not fed.dear:
+    if tangent and isinstance(factor, PixelFactor) and PORT_INDEX[DEAR] not in through:
         by_ports = _with_dear(factor, at, ports, only, value, by_ports)
     wanted = tuple(at - n_own for at in live if at >= n_own)
     if not fed.any or not wanted:
@@ -301,7 +315,8 @@ def linearise(
             assert max(wanted) < len(layout.all("amplitude")), "constants are derived by slopes"
             slopes = np.zeros((*at.values.shape, 2))
         slopes = roomy(slopes, axis=1)
-        by_effects = by_blocks(_by_effects, table, acting, slopes, owner, only=only)
+        derivatives = partial(_by_effects, known=network.effects.known)
+        by_effects = by_blocks(derivatives, table, acting, slopes, owner, only=only)
         together = wanted[-1] - wanted[0] == len(wanted) - 1  # they need no copy
         chosen = slice(wanted[0], wanted[-1] + 1) if together else np.asarray(wanted)
         by_effects = by_effects[:, :, chosen]
@@ -316,7 +331,7 @@ def _with_dear(factor: Factor, at: Present, ports, only, value, by_ports) -> Any
     """
     unit = np.zeros((1, N_PORTS))
     unit[0, PORT_INDEX[DEAR]] = 1.0
-    fed = _chained(partial(_values, dear=True), factor, at, ports + unit, only)
+    fed = _chained(partial(_values, fed=ALL_PORTS), factor, at, ports + unit, only)
     return by_ports + (fed - value)[:, :, None] * unit
 
 
@@ -327,11 +342,15 @@ def _owners(effects: EffectTable, n: int) -> Float[Array, "columns 2 constants"]
 
 
 @program
-def _by_effects(table, acting: Acting, slopes, owner):
+def _by_effects(table, acting: Acting, slopes, owner, known: Known | None):
     """Derivatives of rows by all amplitudes, then by all constants of effects."""
     by_ports, view, pattern = table
     n, components, _ = by_ports.shape
-    entering = (by_ports @ acting.ports.T) * pattern[:, None, :]
+    ports = acting.ports
+    if known is not None:
+        fed = np.array(known.fed, int)
+        by_ports, ports = by_ports[:, :, fed], ports[:, fed]
+    entering = (by_ports @ ports.T) * pattern[:, None, :]
     by_amplitudes = entering * acting.value.T[view][:, None, :]
     slope = jnp.moveaxis(slopes, 1, 0)[view]
     moved = (entering * acting.amplitude)[..., None] * slope[:, None]
@@ -342,16 +361,16 @@ def _by_effects(table, acting: Acting, slopes, owner):
 
 
 @program
-def _derivatives(table, shared, live: tuple[int, ...], dear: bool):
+def _derivatives(table, shared, live: tuple[int, ...], fed: tuple[int, ...]):
     """Values of the rows, and their derivatives by live slots of their own and by all ports."""
     factor, ports = table
     if not live and ports is None:
-        value = _values(table, shared, dear=False)
+        value = _values(table, shared, fed=())
         return value, *(2 * (jnp.zeros((*value.shape, 0)),))
-    return _by_rows(_derivatives_of_row(factor, live, dear), factor, shared, ports)
+    return _by_rows(_derivatives_of_row(factor, live, fed), factor, shared, ports)
 
 
-def _derivatives_of_row(factor: Factor, live: tuple[int, ...], dear: bool = False):
+def _derivatives_of_row(factor: Factor, live: tuple[int, ...], fed: tuple[int, ...] = ()):
     """Function of one row: its value, and its derivatives by live slots of its own and by ports."""
     ends = np.cumsum(factor.widths)
     first = np.concatenate([[0], ends])[:-1]
@@ -365,7 +384,7 @@ def _derivatives_of_row(factor: Factor, live: tuple[int, ...], dear: bool = Fals
         for k, change in zip(moving, free, strict=True):
             part = parts[k]
             own[k] = part.changed(change) if isinstance(part, _Pose) else part + change
-        value = factor.local(own, data, PortValues(ports, dear))
+        value = factor.local(own, data, PortValues(ports, fed))
         return value, value
 
     def row(parts, ports, data):

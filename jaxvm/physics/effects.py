@@ -161,14 +161,52 @@ class Channels(eqx.Module):
         return self.names.index(name)
 
 
+@dataclass(frozen=True)
+class Known:
+    """What is known of a table before a program is traced.
+
+    Attributes:
+        fed: numbers of the ports that it feeds.
+        first: the first column of each course.
+        kind: program behind the basis of each course.
+        course: of each column.
+    """
+
+    fed: tuple[int, ...]
+    first: tuple[int, ...]
+    kind: tuple[int, ...]
+    course: tuple[int, ...]
+
+    first: tuple[int, ...]
+    kind: tuple[int, ...]
+    course: tuple[int, ...]
+
+
 class EffectTable(eqx.Module):
-    """A list of effects as arrays. Unused columns have no port and no pattern."""
+    """A list of effects as arrays. Unused columns have no port and no pattern.
+
+    Where nothing is `known`, a traced program serves all tables of its size: it computes every
+    column by every basis and takes the one that the table has, and all ports.
+    """
 
     ports: Float[Array, "columns ports"]
     channel: Int[Array, " columns"]
     basis: Int[Array, " columns"]
     reference: Float[Array, " columns"]
     constant_index: Int[Array, "columns 2"]  # into the constants of the state; the last is unused
+    known: Known | None = eqx.field(static=True, default=None)
+
+    def specialised(self) -> "EffectTable":
+        """The table for programs of its own: each course is computed once, and no idle port."""
+        if not self.n_columns:
+            return self
+        parts = self.basis, self.channel, self.reference, *np.asarray(self.constant_index).T
+        rows = np.stack([np.asarray(part, float) for part in parts], axis=1)
+        _, first, course = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+        kind = kinds_of(np.asarray(self.basis)[first])
+        fed = np.flatnonzero(np.asarray(self.ports).any(axis=0))
+        known = Known(*(tuple(part.ravel().tolist()) for part in (fed, first, kind, course)))
+        return replace(self, known=known)
 
     @property
     def n_columns(self) -> int:
@@ -208,7 +246,8 @@ def tabulate(
                 amplitudes[column] = given[column - start]
                 column += 1
         first_constant += len(own)
-    table = EffectTable(*map(jnp.asarray, (ports, channel, basis, reference, constant_index)))
+    parts = map(jnp.asarray, (ports, channel, basis, reference, constant_index))
+    table = EffectTable(*parts, known=None)
     return table, amplitudes, constants
 
 
@@ -244,14 +283,24 @@ def courses(
     table: EffectTable, constants: Float[Array, " constants"], channels: Channels
 ) -> Float[Array, "columns views"]:
     """Course of every column at the views. Differentiable in the constants."""
-    return _in_views(_at_epochs, *_columns(table, constants), channels)
+    return _of_columns(_at_epochs, table, constants, channels)
 
 
 def course_slopes(
     table: EffectTable, constants: Float[Array, " constants"], channels: Channels
 ) -> Float[Array, "columns views 2"]:
     """Derivative of every column's course with respect to its own two constants."""
-    return _in_views(_slopes, *_columns(table, constants), channels)
+    return _of_columns(_slopes, table, constants, channels)
+
+
+def _of_columns(function, table: EffectTable, constants, channels: Channels) -> Any:
+    columns, known = _columns(table, constants), table.known
+    if known is None:
+        return _in_views(function, *columns, channels)
+    first = np.array(known.first)
+    basis, channel, reference, values = (part[first] for part in columns)
+    found = _in_views(function, basis, channel, reference, values, channels, known.kind)
+    return found[np.array(known.course)]
 
 
 _FEW = 16
@@ -277,8 +326,19 @@ def evaluate(basis, channel, reference, constants, channels: Channels) -> Float[
     return _in_views(_at_epochs, basis, channel, reference, constants, channels)
 
 
-def _in_views(function, basis, channel, reference, constants, channels: Channels) -> Any:
-    """A function of courses at the epochs, for the views of one camera after the other."""
+def _in_views(
+    function,
+    basis,
+    channel,
+    reference,
+    constants,
+    channels: Channels,
+    kinds: tuple[int, ...] | None = None,
+) -> Any:
+    """A function of courses at the epochs, for the views of one camera after the other.
+
+    `kinds` are those of the bases, where they are known before a program is traced.
+    """
     together = whole(basis, channel, reference, constants, channels.values)
     values, reads = channels.values, channels.reads
     if not together:
@@ -286,7 +346,8 @@ def _in_views(function, basis, channel, reference, constants, channels: Channels
 
     def of(camera: int, chosen: Any = slice(None)):
         x = values[reads[channel, camera]] - reference[:, None]
-        return _by_kinds(function, (basis[chosen], x[chosen], constants[chosen]), channels)
+        rows = basis[chosen], x[chosen], constants[chosen]
+        return _by_kinds(function, rows, channels, kinds)
 
     found = [of(0)]
     for camera in range(1, reads.shape[1]):
@@ -304,11 +365,18 @@ def _in_views(function, basis, channel, reference, constants, channels: Channels
     return found[0] if len(found) == 1 else joined.concatenate(found, axis=1)
 
 
-def _by_kinds(function, rows, channels: Channels) -> Any:
+def _by_kinds(function, rows, channels: Channels, kinds: tuple[int, ...] | None) -> Any:
     """A function of courses at the epochs, evaluated for those of one kind of basis at once."""
     n, grid = len(channels.epoch_time), (channels.time, channels.epoch_time)
     if whole(rows, grid) or not len(rows[0]):
-        return function(rows, *grid)
+        if kinds is None:
+            return function(rows, *grid)
+        places = [np.flatnonzero(np.array(kinds) == kind) for kind in sorted(set(kinds))]
+        each = [
+            function(tuple(part[own] for part in rows), *grid, kinds=(kinds[own[0]],))
+            for own in places
+        ]
+        return jnp.concatenate(each)[np.argsort(np.concatenate(places))]
     # Spare times: a recording of another length is no other program.
     grid = continued(channels.time), roomy(channels.epoch_time)
     basis, x, constants = map(np.asarray, rows)

@@ -149,19 +149,24 @@ DEAR = "target.disc"
 """The port that takes as long as all others together: the chain leaves it out where nothing feeds
 it."""
 
+ALL_PORTS = tuple(range(N_PORTS))
+CHEAP_PORTS = tuple(k for k in ALL_PORTS if PORTS[k].name != DEAR)
+
 
 class PortValues:
     """Read a vector of port values by name; without a vector every port is exactly zero.
 
-    `dear` tells whether the port `DEAR` may be other than zero.
+    `fed` are the ports that may be other than zero.
 
     The vector is split once, by one operation whose transpose is one concatenation; slicing it port
     by port would cost a padded sum for each in reverse mode.
     """
 
-    def __init__(self, values: Float[Array, " ports"] | None = None, dear: bool = True):
+    def __init__(
+        self, values: Float[Array, " ports"] | None = None, fed: tuple[int, ...] = ALL_PORTS
+    ):
         self.plain = values is None
-        self.dear = dear and not self.plain
+        self.fed = frozenset(() if self.plain else fed)
         if values is not None:
             self._values = [part[0] for part in jax.lax.split(values, (1,) * N_PORTS)]
 
@@ -169,13 +174,19 @@ class PortValues:
         """The same values, which are not differentiated."""
         held = PortValues()
         if not self.plain:
-            held.plain, held.dear = False, self.dear
+            held.plain, held.fed = False, self.fed
             held._values = jax.lax.stop_gradient(self._values)
         return held
 
     def __getitem__(self, name: str) -> Float[Array, ""] | float:
         """Value of one port, in its unit."""
-        return 0.0 if self.plain else self._values[PORT_INDEX[name]]
+        port = PORT_INDEX[name]
+        return self._values[port] if port in self.fed else 0.0
+
+    @property
+    def dear(self) -> bool:
+        """Whether the dear port may be other than zero."""
+        return PORT_INDEX[DEAR] in self.fed
 
     def axes(self, prefix: str) -> Float[Array, "3"]:
         """The three components `prefix_x, prefix_y, prefix_z`."""

@@ -330,6 +330,12 @@ def in_levels(problem: Problem) -> Problem:
     return eqx.tree_at(lambda p: p.levels, problem, levels, is_leaf=lambda leaf: leaf is None)
 
 
+def specialised(problem: Problem) -> Problem:
+    """The problem for a program of its own, which is worth compiling where it runs many times."""
+    effects = problem.network.effects.specialised()
+    return eqx.tree_at(lambda p: p.network.effects, in_levels(problem), effects)
+
+
 def packet_products(
     packets: Packets,
     left: Float[Array, "obs comps own"],
