@@ -4,9 +4,10 @@
 
 The deformation scene (two cameras, three targets) is simulated without hidden physics over more and
 more epochs, its plain model fitted, and more and more hypotheses are scored, with 299 sign-flips
-for the null distribution and without. A size runs in a process of its own, so that its peak memory
-is known. Refitting is the adjustment with one hypothesis in the model, as the diagnosis does it
-with the few that lead; what it would take for all is that of the median of a few, warm.
+for the null distribution and without. Each size runs in a process of its own, so that its peak
+memory is known. Refitting, in another one, is the adjustment with one hypothesis in the model, as
+the diagnosis does it with the few that lead; what it would take for all is that of the median of a
+few, warm.
 Writes results.json, results.md and results.png.
 """
 
@@ -51,11 +52,8 @@ def some(families, wanted: int):
     return tuple(family for family in kept if family.valid.any())
 
 
-def one(epochs: int, wanted: list[int]) -> dict:
-    """Times of scoring so many hypotheses on a scene of so many epochs, and of refitting one."""
-    from jaxvm.discover.noise import random_signs
-    from jaxvm.discover.score import ScoreTests
-    from jaxvm.discover.space import enumerate_hypotheses, member
+def fitted(epochs: int):
+    """The plain model of a scene of so many epochs, adjusted."""
     from jaxvm.network.scene import build
     from jaxvm.network.start import start
     from jaxvm.recording import read_recording
@@ -67,30 +65,50 @@ def one(epochs: int, wanted: list[int]) -> dict:
     with tempfile.TemporaryDirectory() as place:
         made = simulate_deformation_scene((), seed=5, size="asked")
         recording = read_recording(made.write(Path(place) / "recording"))
-    fit = adjust(start(build(recording)).with_effects((), (16, 8)))
+    return adjust(start(build(recording)).with_effects((), (16, 8)))
+
+
+def score(epochs: int, wanted: int) -> dict:
+    """Times of scoring so many hypotheses on a scene of so many epochs, and the memory it takes."""
+    from jaxvm.discover.noise import random_signs
+    from jaxvm.discover.score import ScoreTests
+    from jaxvm.discover.space import enumerate_hypotheses
+
+    fit = fitted(epochs)
+    recording = fit.scene.recording
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    families = enumerate_hypotheses(fit.scene)
-    rows = []
-    for number in wanted:
-        few = some(families, number)
-        for flips in (0, 299):
-            seconds = []
-            signs = random_signs(len(recording.time), flips, 0) if flips else None
-            for _ in range(ROUNDS + 1):
-                began = time.perf_counter()
-                ranking = ScoreTests.of(fit, few).score(1.0, signs)
-                seconds.append(time.perf_counter() - began)
-            rows.append(
-                {
-                    "hypotheses": ranking.n,
-                    "flips": flips,
-                    "first_s": seconds[0],
-                    "seconds": float(np.median(seconds[1:])),
-                }
-            )
-    refits = []
-    few = some(families, MANY)
-    rng = np.random.default_rng(0)
+    few = some(enumerate_hypotheses(fit.scene), wanted)
+    times: dict[str, dict] = {}
+    for name, flips in (("plain", 0), ("flipped", 299)):
+        seconds, found = [], 0
+        signs = random_signs(len(recording.time), flips, 0) if flips else None
+        for _ in range(ROUNDS + 1):
+            began = time.perf_counter()
+            found = ScoreTests.of(fit, few).score(1.0, signs).n
+            seconds.append(time.perf_counter() - began)
+        times[name] = {
+            "hypotheses": found,
+            "first_s": seconds[0],
+            "seconds": float(np.median(seconds[1:])),
+        }
+    return {
+        "epochs": epochs,
+        "residuals": 2 * len(recording.observations.epoch) + len(recording.ranges.epoch),
+        **times["plain"],
+        "flipped_s": times["flipped"]["seconds"],
+        "memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6,
+        "memory_before_mb": before * 1024 / 1e6,
+    }
+
+
+def refit(epochs: int, wanted: int) -> dict:
+    """Seconds that refitting one of so many hypotheses takes, warm: the median of a few."""
+    from jaxvm.discover.space import enumerate_hypotheses, member
+    from jaxvm.solve.adjust import adjust
+
+    fit = fitted(epochs)
+    few = some(enumerate_hypotheses(fit.scene), wanted)
+    rng, seconds = np.random.default_rng(0), []
     for _ in range(REFITS):
         family = few[rng.integers(len(few))]
         g, c, s = rng.permutation(np.argwhere(family.valid))[0]
@@ -100,26 +118,18 @@ def one(epochs: int, wanted: list[int]) -> dict:
         adjust(with_it, check=False)
         began = time.perf_counter()
         adjust(with_it, check=False)
-        refits.append(time.perf_counter() - began)
-    return {
-        "epochs": epochs,
-        "residuals": 2 * len(recording.observations.epoch) + len(recording.ranges.epoch),
-        "rows": rows,
-        "refit_s": float(np.median(refits)),
-        "memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-        "memory_before_mb": before / 1024,
-    }
+        seconds.append(time.perf_counter() - began)
+    return {"refit_s": float(np.median(seconds))}
 
 
-def apart(epochs: int, wanted: list[int]) -> dict:
-    """The same in a process of its own."""
-    command = [sys.executable, __file__, "--one", str(epochs), *map(str, wanted)]
+TASKS = {"score": score, "refit": refit}
+
+
+def apart(task: str, epochs: int, wanted: int) -> dict:
+    """A task in a process of its own."""
+    command = [sys.executable, __file__, "--one", task, str(epochs), str(wanted)]
     said = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     return json.loads(said.splitlines()[-1])
-
-
-def plain(size: dict) -> list[dict]:
-    return [row for row in size["rows"] if not row["flips"]]
 
 
 def table(found: dict) -> str:
@@ -133,22 +143,22 @@ def table(found: dict) -> str:
         "",
         f"{target['hypotheses']:,} hypotheses on {target['residuals']:,} residuals: "
         f"**{target['seconds']:.2f} s** ({target['flipped_s']:.2f} s with 299 sign-flips), peak "
-        f"memory of the whole process {target['memory_mb']:.0f} MB. Refitting takes "
+        f"memory of the process {target['memory_mb']:,.0f} MB, of which "
+        f"{target['memory_before_mb']:,.0f} MB before the first score. Refitting takes "
         f"{target['refit_s']:.2f} s for one hypothesis, {target['factor']:,.0f} times as long for "
         "all.",
         "",
         "Time grows with the residuals as n^{:.2f} ± {:.2f}, ".format(*found["of_residuals"])
         + "with the hypotheses as n^{:.2f} ± {:.2f}.".format(*found["of_hypotheses"]),
         "",
-        "| residuals | hypotheses | sign-flips | seconds | first call | peak memory of the size |",
+        "| residuals | hypotheses | seconds | with 299 sign-flips | first call | peak memory |",
         "|---|---|---|---|---|---|",
+        *(
+            f"| {size['residuals']:,} | {size['hypotheses']:,} | {size['seconds']:.3f} | "
+            f"{size['flipped_s']:.3f} | {size['first_s']:.2f} | {size['memory_mb']:,.0f} MB |"
+            for size in found["sizes"]
+        ),
     ]
-    for size in found["sizes"]:
-        for row in size["rows"]:
-            lines.append(
-                f"| {size['residuals']:,} | {row['hypotheses']:,} | {row['flips']} | "
-                f"{row['seconds']:.3f} | {row['first_s']:.2f} | {size['memory_mb']:.0f} MB |"
-            )
     return "\n".join(lines) + "\n"
 
 
@@ -161,7 +171,7 @@ def draw(found: dict) -> Figure:
     left.set(
         xlabel="residuals",
         ylabel="seconds",
-        title=f"{by_size[0]['hypotheses']:,} hypotheses or so: n^{found['of_residuals'][0]:.2f}",
+        title=f"{by_size[-1]['hypotheses']:,} hypotheses or so: n^{found['of_residuals'][0]:.2f}",
     )
     many = found["by_hypotheses"]
     right.semilogx([r["hypotheses"] for r in many], [r["seconds"] for r in many], "o-")
@@ -180,48 +190,44 @@ def draw(found: dict) -> Figure:
 def main() -> None:
     parser = argparse.ArgumentParser(description="time the scoring of hypotheses")
     parser.add_argument("--quick", action="store_true", help="two small sizes, nothing written")
-    parser.add_argument("--one", type=int, nargs="+", default=None, help=argparse.SUPPRESS)
+    parser.add_argument("--one", nargs=3, default=None, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.one:
-        print(json.dumps(one(options.one[0], options.one[1:])))
+        task, *numbers = options.one
+        print(json.dumps(TASKS[task](*map(int, numbers))))
         return
     epochs = EPOCHS[:2] if options.quick else EPOCHS
     long = epochs[-1] if options.quick else LONG
     sizes = []
     for number in epochs:
-        sizes.append(apart(number, list(HYPOTHESES if number == long else (MANY,))))
-        print(json.dumps(sizes[-1]), flush=True)
-    of_long = next(size for size in sizes if size["epochs"] == long)
-    target = min(plain(of_long), key=lambda row: abs(row["hypotheses"] - MANY))
-    flipped = next(
-        row for row in of_long["rows"] if row["flips"] and row["hypotheses"] == target["hypotheses"]
-    )
-    by_residuals = [
-        {"residuals": size["residuals"]}
-        | min(plain(size), key=lambda row: abs(row["hypotheses"] - MANY))
-        for size in sizes
-    ]
-    by_hypotheses = plain(of_long)
+        for wanted in HYPOTHESES if number == long else (MANY,):
+            sizes.append(apart("score", number, wanted))
+            print(json.dumps(sizes[-1]), flush=True)
+
+    def nearest(number: int) -> dict:
+        own = (size for size in sizes if size["epochs"] == number)
+        return min(own, key=lambda size: abs(size["hypotheses"] - MANY))
+
+    refit_s = apart("refit", long, MANY)["refit_s"]
+    target = nearest(long)
+    by_residuals = [nearest(number) for number in epochs]
+    by_hypotheses = [size for size in sizes if size["epochs"] == long]
+
+    def grows(rows: list[dict], by: str) -> tuple[float, float]:
+        return results.exponent([row[by] for row in rows], [row["seconds"] for row in rows])
+
     found = {
         "processors": os.cpu_count(),
         "sizes": sizes,
         "target": {
             **target,
-            "residuals": of_long["residuals"],
-            "flipped_s": flipped["seconds"],
-            "refit_s": of_long["refit_s"],
-            "factor": of_long["refit_s"] * target["hypotheses"] / target["seconds"],
-            "memory_mb": of_long["memory_mb"],
+            "refit_s": refit_s,
+            "factor": refit_s * target["hypotheses"] / target["seconds"],
         },
         "by_residuals": by_residuals,
         "by_hypotheses": by_hypotheses,
-        "of_residuals": results.exponent(
-            [row["residuals"] for row in by_residuals], [row["seconds"] for row in by_residuals]
-        ),
-        "of_hypotheses": results.exponent(
-            [row["hypotheses"] for row in by_hypotheses],
-            [row["seconds"] for row in by_hypotheses],
-        ),
+        "of_residuals": grows(by_residuals, "residuals"),
+        "of_hypotheses": grows(by_hypotheses, "hypotheses"),
     }
     if options.quick:
         print(table(found))

@@ -24,7 +24,7 @@ from jaxvm.recording import Drivers, Recording
 from jaxvm.solve.adjust import Adjustment, adjust
 from jaxvm.solve.covariance import standard_deviations
 
-_RTOL = 1e-8
+ENOUGH = 1e-8
 """Change of the cost that ends the adjustment: with 20,000 residuals no unknown moves by more than
 0.015 of its standard deviation then.
 
@@ -64,7 +64,7 @@ def adjusted(plain: Adjustment, drifts: list[CameraDrift], inputs: Inputs) -> Ad
         effects += _effects(drift, inputs.only(drift.dynamics.inputs).ranges())
     scene = replace(build(recording, ()), state=plain.scene.state)
     scene = scene.with_effects((*recording.model.effects, *effects))
-    return adjust(scene, rtol=_RTOL, check=False, repeats=0)
+    return adjust(scene, rtol=ENOUGH, check=False, repeats=0)
 
 
 def _late(name: str, delay: float) -> str:

@@ -15,5 +15,6 @@ from jaxvm.montecarlo.run import Progress as Progress
 from jaxvm.montecarlo.run import run as run
 from jaxvm.montecarlo.statistics import Statistics as Statistics
 from jaxvm.montecarlo.trials import OneByOne as OneByOne
+from jaxvm.montecarlo.trials import Together as Together
 from jaxvm.montecarlo.trials import Traced as Traced
 from jaxvm.montecarlo.trials import Trial as Trial

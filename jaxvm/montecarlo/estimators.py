@@ -67,12 +67,20 @@ class GaussNewton(eqx.Module):
 
 
 class LevenbergMarquardt(eqx.Module):
-    """Damped steps: for starts that may be far, and robust losses."""
+    """Damped steps: for starts that may be far, and robust losses.
+
+    Attributes:
+        limit: bound on evaluations.
+        rtol: relative change of the cost at which it has converged.
+        damping: of the first step, in units of the diagonal.
+    """
 
     limit: Any = eqx.field(default=100, converter=jnp.asarray)
+    rtol: Any = eqx.field(default=1e-12, converter=jnp.asarray)
+    damping: Any = eqx.field(default=1e-3, converter=jnp.asarray)
 
     def __call__(self, problem: Problem, key: PRNGKeyArray) -> Estimate:
-        solver = levenberg_marquardt(limit=self.limit)
+        solver = levenberg_marquardt(self.rtol, limit=self.limit, damping=self.damping)
         found = optx.least_squares(
             _residual, solver, jnp.zeros(problem.n), problem, max_steps=None, throw=False
         )
