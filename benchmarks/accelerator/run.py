@@ -36,8 +36,8 @@ import results  # noqa: E402
 ROUNDS = 3
 
 SETTLED = 1e-2
-"""Change of an unknown, in the unit that its observations give it, at which float32 is settled (as
-in `../monte_carlo/devices.py`)."""
+"""Length of a step (standard deviations) at which float32 is settled (as in
+`../monte_carlo/devices.py`)."""
 
 
 def of(folder: str, file: str) -> Any:
@@ -135,14 +135,9 @@ def scoring(epochs: int, hypotheses: int) -> dict:
     """Hypotheses scored on the deformation scene: tangents on the device, products on the host."""
     benchmark = of("scoring", "run.py")
     benchmark.ROUNDS, benchmark.REFITS = 2, 1
-    found = benchmark.one(epochs, [hypotheses])
-    row = next(row for row in found["rows"] if not row["flips"])
-    return {
-        "first_s": row["first_s"],
-        "seconds": row["seconds"],
-        "residuals": found["residuals"],
-        "refit_s": found["refit_s"],
-    }
+    found = benchmark.score(epochs, hypotheses)
+    told = {name: found[name] for name in ("first_s", "seconds", "residuals")}
+    return told | benchmark.refit(epochs, hypotheses)
 
 
 def diagnosis() -> dict:

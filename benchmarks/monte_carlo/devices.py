@@ -26,7 +26,7 @@ HERE = Path(__file__).parent
 DEVICES = (1, 2, 4, 8)
 LONG, FEW = (3, 6, 12, 24, 48), 3_000
 SETTLED = 1e-2
-"""Change of an unknown, in the unit that its observations give it, at which float32 is settled."""
+"""Length of a step (standard deviations) at which float32 is settled."""
 ROUNDS = 5
 
 

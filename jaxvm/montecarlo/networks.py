@@ -5,7 +5,7 @@ residual, the same normal equations.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import equinox as eqx
@@ -137,7 +137,10 @@ def network_study(
     covariance = np.asarray(_covariance(problem, normal.hessian, quantity))
     _, in_parts = ravel_pytree(named(quantity(problem.state(jnp.zeros(problem.n)))))
     sigma = in_parts(jnp.asarray(np.sqrt(np.diagonal(covariance))))
-    source = None if world is None else (world.network, world.state)
+    source = None
+    if world is not None:
+        effects = world.network.effects.specialised()
+        source = replace(world.network, effects=effects), world.state
     problem = specialised(problem)
     trial = NetworkTrial(problem, quantity, estimator, noise, truth, source, sigma)
     about = {"kind": "network", "noise": name_of(noise), "estimator": name_of(estimator)}
