@@ -5,9 +5,9 @@
 The deformation scene (two cameras, three targets) is simulated without hidden physics over more and
 more epochs, its plain model fitted, and more and more hypotheses are scored, with 299 sign-flips
 for the null distribution and without. Each size runs in a process of its own, so that its peak
-memory is known. Refitting, in another one, is the adjustment with one hypothesis in the model, as
-the diagnosis does it with the few that lead; what it would take for all is that of the median of a
-few, warm.
+memory is known. Refitting, in another one, is what the diagnosis does with the few hypotheses that
+lead (`jaxvm.discover.select.refit`, here without epochs that are set aside); what it would take for
+all is that of the median of a few that are drawn at random, warm.
 Writes results.json, results.md and results.png.
 """
 
@@ -103,21 +103,23 @@ def score(epochs: int, wanted: int) -> dict:
 
 def refit(epochs: int, wanted: int) -> dict:
     """Seconds that refitting one of so many hypotheses takes, warm: the median of a few."""
+    from jaxvm.discover.heldout import split
+    from jaxvm.discover.select import refit as refitted
     from jaxvm.discover.space import enumerate_hypotheses, member
-    from jaxvm.solve.adjust import adjust
 
     fit = fitted(epochs)
+    sound = tuple(np.ones(len(rows)) for rows in fit.scene.tables)
+    every = split(fit.scene, np.zeros(epochs, bool), sound)
     few = some(enumerate_hypotheses(fit.scene), wanted)
     rng, seconds = np.random.default_rng(0), []
     for _ in range(REFITS):
         family = few[rng.integers(len(few))]
         g, c, s = rng.permutation(np.argwhere(family.valid))[0]
         hypothesis = member(family, (int(g), int(c), int(s)), fit.scene)
-        effect = hypothesis.effect((0.0,) * (family.n_terms * family.n_bases))
-        with_it = fit.scene.with_effects((effect,), (16, 8))
-        adjust(with_it, check=False)
+        amplitudes = np.zeros(family.n_terms * family.n_bases)
+        refitted(fit, hypothesis, amplitudes, every)
         began = time.perf_counter()
-        adjust(with_it, check=False)
+        refitted(fit, hypothesis, amplitudes, every)
         seconds.append(time.perf_counter() - began)
     return {"refit_s": float(np.median(seconds))}
 
