@@ -306,6 +306,11 @@ def test_a_study_of_compensation_under_noise():
         structure_study(*days, drift, CONTINUOUS[1])
     with pytest.raises(ValueError, match="drifts do not fit"):
         structure_study(*days, drift[:-1], CONTINUOUS[2])
+    with pytest.raises(ValueError, match="single precision"):
+        structure_study(*days, drift, CONTINUOUS[0]).in_single_precision()
+    model = replace(days[1].model, cameras=(replace(days[1].model.cameras[0], name="other"),))
+    with pytest.raises(ValueError, match="has no camera left"):
+        structure_study(days[0], replace(days[1], model=model), drift, CONTINUOUS[0])
 
 
 def test_a_model_survives_its_file(identified, tmp_path):

@@ -318,6 +318,9 @@ def test_scores_of_noise_are_chi_square(tmp_path):
     # no less than a single one.
     assert np.mean(drops) <= chi2.ppf(1.0 - 0.3 / n, 1) + 3.0
     assert np.mean(drops > chi2.isf(0.1, 1)) >= 0.1 - 3.0 * np.sqrt(0.09 / 300)
+    other = next(f for f in every if f.n_terms * f.n_bases == 1 and f is not one)
+    with pytest.raises(FileExistsError):
+        run(score_study(fit, (other,)), 0, 301, folder=tmp_path / "noise")
     shape = (len(fit.scene.recording.observations.pixel), 2)
     with pytest.raises(ValueError, match="does not fit"):
         score_study(fit, (one,), np.zeros((shape[0] + 1, 2)))

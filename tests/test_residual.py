@@ -390,7 +390,8 @@ def test_blocks_are_the_whole_table(exact):
 
 
 @pytest.mark.parametrize("tangent", [False, True])
-def test_a_program_of_its_own_is_the_whole_table(stereo, tangent):
+@pytest.mark.parametrize("compiled", [eqx.filter_jit, lambda function: function])
+def test_a_program_of_its_own_is_the_whole_table(stereo, tangent, compiled):
     """What is known of the effects before a program is traced leaves out what changes nothing."""
     _, scene = stereo
     scope = Scope(camera=("left",))
@@ -399,23 +400,25 @@ def test_a_program_of_its_own_is_the_whole_table(stereo, tangent):
         Effect("lag", terms[:2], "time", "lag with state", (0.7,), 0.1, scope, (2e-4, 0, 1e-4, 0)),
         Effect("again", terms[1:], "time", "lag", (0.7,), 0.1, Scope(), (2e-4, 0.5), shares="lag"),
         Effect("whole", (Term("lens.k1"),), "constant", "constant", amplitudes=(1e-3,)),
+        Effect("range", (Term("range.scale"),), "constant", "constant", amplitudes=(1e-3,)),
     )
     scene = scene.with_effects(effects)
     network, flat = scene.network, scene.state.flatten()
     own = replace(network, effects=network.effects.specialised())
     known = own.effects.known
-    assert len(known.fed) == 4 and len(set(known.course)) == 4 < network.effects.n_columns
+    assert len(known.fed) == 5 and len(set(known.course)) == 4 < network.effects.n_columns
     amplitudes, constants = (len(network.layout.all(f)) for f in ("amplitude", "constant"))
-    for factor in network.pixels:
+    assert network.ranges is not None
+    for factor in (*network.pixels, network.ranges):
         live = tuple(range(factor.slots.shape[1] + amplitudes + constants - 1))
-        find = eqx.filter_jit(linearised)
+        find = compiled(linearised)
         some, every = (find(factor, net, flat, live, tangent) for net in (own, network))
         used = np.asarray(factor.weight) > 0.0
         for a, b in zip(some[: 2 + tangent], every, strict=False):
             np.testing.assert_allclose(a[used], b[used], rtol=1e-9, atol=1e-9)
         fed = np.array(known.fed)
         np.testing.assert_allclose(some[2][used][..., fed], every[2][used][..., fed], rtol=1e-9)
-    some, every = (eqx.filter_jit(residual)(scene.state, net) for net in (own, network))
+    some, every = (compiled(residual)(scene.state, net) for net in (own, network))
     for a, b in zip(jax.tree.leaves(some), jax.tree.leaves(every), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
 

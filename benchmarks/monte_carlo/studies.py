@@ -6,8 +6,8 @@ Scores: residuals of noise alone on the deformation scene, against all hypothese
 what is known of these is kept either way. Compensation: a camera of `../drift/world.py` watches a
 plate while temperature changes; a model of one time constant is learnt from images that are
 noisier each time, and the drift that it leaves of another day is measured; one after the other by
-the whole `identify`, together by its one adjustment. The same trials are drawn either way, and must
-agree. Medians of warm runs, compiling apart. Writes results-studies.json and results-studies.md.
+the whole `identify`, together by its last adjustment alone. The same trials are drawn either way;
+how far they differ stands in the table. Medians of warm runs, compiling apart. Writes results-studies.json and results-studies.md.
 """
 
 import json

@@ -29,7 +29,7 @@ from jaxvm.network.state import State
 from jaxvm.recording import Recording
 from jaxvm.solve.problem import Problem, normal_at, scaled, scene_problem, specialised
 
-_FROM_NEAR = LevenbergMarquardt(rtol=ENOUGH, damping=1e-11)
+_DAMPING = 1e-11
 """From the answer without noise a full step is nearly right; damping comes where it is not."""
 
 
@@ -71,8 +71,11 @@ def compensation_study(
             noted={"before_px": _rms(drift)},
         )
 
-    numbers = [own.observations.pixel for own in (train, other)], drift, noise
-    about = {"kind": "compensation", "noise": name_of(noise), "numbers": fingerprint(numbers)}
+    both = [(own.observations.pixel, own.observations.sigma) for own in (train, other)]
+    numbers = fingerprint(
+        (both, drift, noise), words=sorted((k, v) for k, v in how.items() if not callable(v))
+    )
+    about = {"kind": "compensation", "noise": name_of(noise), "numbers": numbers}
     return OneByOne(trial, about | (told or {}), (ValueError, ArithmeticError))
 
 
@@ -88,8 +91,9 @@ def structure_study(
     """The study of what a drift model of one structure takes off another history of temperature.
 
     A trial draws noise on the pixels of the training and adjusts its network with the gains and
-    time constants of all cameras, as `identify` does in its one step; which ports of a camera show
-    and a delay are those found without noise. It gives and notes what `compensation_study` does.
+    time constants of all cameras, as `identify` does in its one step, begun at the answer without
+    noise; which ports of a camera show and a delay are those of that, too. It gives and notes what
+    `compensation_study` does. Not for single precision: the normal equations are too near singular.
 
     Args:
         train, other: recordings without noise; the sigmas of `train` are those of the noise.
@@ -101,7 +105,8 @@ def structure_study(
 
     Raises:
         ValueError: drifts that are not those of the observations of `other`; a parabola or no drift
-            at all, whose gains are no part of the network; what `identify` raises.
+            at all, whose gains are no part of the network; a camera of the training that is not in
+            `other`; an adjustment without noise that fails; what `identify` raises.
     """
     _check(drift, other)
     if structure.power != 1:
@@ -110,15 +115,28 @@ def structure_study(
         )
     found = identify(train, [structure], one_step=False)
     drifts = [own.drift for own in found.cameras]
+    missing = {own.camera for own in drifts} - {own.name for own in other.model.cameras}
+    if missing:
+        raise ValueError(f"the other recording has no camera {', '.join(sorted(missing))}")
     inputs = inputs_of(train)
     fit = adjusted(found.plain, drifts, inputs)
+    if fit.failed:
+        raise ValueError(f"the training can't be adjusted with {structure.name}: {fit.why}")
     problem = scene_problem(fit.scene)
     problem, _ = scaled(problem, normal_at(problem, jnp.zeros(problem.n)))
     learnt = [_Learnt.of(own, fit.scene, inputs, other) for own in drifts if is_effects(own)]
-    estimator = _FROM_NEAR if estimator is None else estimator
+    if estimator is None:
+        estimator = LevenbergMarquardt(rtol=ENOUGH, damping=_DAMPING)
     trial = _Learning(specialised(problem), learnt, jnp.asarray(drift), noise, estimator)
     about = {"kind": "compensation", "noise": name_of(noise), "estimator": name_of(estimator)}
-    return Traced(trial, about | {"numbers": fingerprint(trial)} | (told or {}))
+    return _StructureStudy(trial, about | {"numbers": fingerprint(trial)} | (told or {}))
+
+
+class _StructureStudy(Traced):
+    """In double precision alone: in single, a matrix that has no factors is no failure (yet)."""
+
+    def in_single_precision(self) -> Traced:
+        raise ValueError("gains and time constants are too near each other for single precision")
 
 
 class _Learnt(eqx.Module):

@@ -17,8 +17,8 @@ from jaxvm.montecarlo.trials import Together, Trial, fingerprint, name_of
 from jaxvm.network.draw import Noise
 from jaxvm.solve.adjust import Adjustment
 
-_TOGETHER, _AT_ONCE = 32, 8_000_000
-"""Trials of a batch, more are hardly faster; and numbers in their residuals and scores (64 MB)."""
+_TOGETHER, _AT_ONCE = 32, 64_000_000
+"""Trials of a batch, more are hardly faster; and numbers in their residuals and scores (512 MB)."""
 
 
 def score_study(
@@ -48,9 +48,10 @@ def score_study(
     shape = (len(tests.arrangement.drivers), tests.arrangement.components)
     if hidden is not None and np.shape(hidden) != shape:
         raise ValueError(f"a hidden change of shape {np.shape(hidden)} does not fit {shape}")
-    about = {"kind": "score", "hypotheses": len(families), "noise": name_of(noise)}
-    measured = fit.scene.recording.observations.pixel
-    about |= {"numbers": fingerprint((measured, hidden, noise))} | (told or {})
+    about: dict[str, Any] = {"kind": "score", "noise": name_of(noise)}
+    asked = [(f.groups, f.courses, f.scopes) for f in families]
+    numbers = fit.scene.state, fit.scene.network, [f.valid for f in families], hidden, noise
+    about |= {"numbers": fingerprint(numbers, words=(asked, fit.scene.effects))} | (told or {})
 
     @jax.jit
     def drawn(keys):
@@ -63,7 +64,8 @@ def score_study(
         largest = [_largest(ranking) for ranking in tests.score_many(1.0, residuals)]
         return jax.tree.map(lambda *parts: np.stack(parts), *largest)
 
-    numbers = np.prod(shape) + tests.battery.n_columns
+    room = [f.valid.size * (2 + f.n_terms * f.n_bases) for f in families]
+    numbers = np.prod(shape) + sum(room)
     return Together(trials, about, together=int(np.clip(_AT_ONCE // numbers, 1, _TOGETHER)))
 
 

@@ -112,9 +112,12 @@ def name_of(function: Callable) -> str:
     return getattr(function, "__qualname__", type(function).__qualname__)
 
 
-def fingerprint(tree: Any) -> str:
-    """Hash of all numbers of a trial, or of what else makes one: other sigmas are another."""
-    found = hashlib.sha256()
+def fingerprint(tree: Any, words: Any = None) -> str:
+    """Hash of all numbers of a trial, or of what else makes one: other sigmas are another.
+
+    `words` are what has no arrays: tuples of names and numbers.
+    """
+    found = hashlib.sha256(b"" if words is None else repr(words).encode())
     for leaf in jax.tree.leaves(eqx.filter(tree, eqx.is_array)):
         found.update(str(leaf.shape).encode() + np.ascontiguousarray(leaf).tobytes())
     return found.hexdigest()[:16]

@@ -177,10 +177,6 @@ class Known:
     kind: tuple[int, ...]
     course: tuple[int, ...]
 
-    first: tuple[int, ...]
-    kind: tuple[int, ...]
-    course: tuple[int, ...]
-
 
 class EffectTable(eqx.Module):
     """A list of effects as arrays. Unused columns have no port and no pattern.

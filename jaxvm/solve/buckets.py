@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+from scipy.sparse import coo_array
 
 
 class Buckets(eqx.Module):
@@ -56,8 +57,18 @@ class Buckets(eqx.Module):
 
 
 def in_order(numbers: Int[np.ndarray, " n"], bound: int) -> Int[np.ndarray, " n"]:
-    """Places in ascending order of numbers below a bound; NumPy counts where they are short."""
-    return np.argsort(numbers.astype(np.uint16) if bound <= 1 << 16 else numbers, kind="stable")
+    """Places in ascending order of numbers below a bound, equal ones in their own order.
+
+    NumPy counts where numbers are short; for others SciPy does, which lists a matrix row by row.
+    """
+    n = len(numbers)
+    if bound <= 1 << 16:
+        return np.argsort(numbers.astype(np.uint16), kind="stable")
+    if max(n, bound) > np.iinfo(np.int32).max:
+        return np.argsort(numbers, kind="stable")
+    place = numbers.astype(np.int32), np.arange(n, dtype=np.int32)
+    listed = coo_array((np.ones(n, np.int8), place), shape=(bound, n)).tocsr()
+    return listed.indices.astype(int)
 
 
 def padded(values: Float[Array, "members ..."]) -> Float[Array, "members_and_1 ..."]:

@@ -22,6 +22,7 @@ from jaxvm.network.state import Layout, State
 from jaxvm.network.unknowns import Unknowns
 from jaxvm.physics.blocks import rounded
 from jaxvm.solve.arrow import Arrow, NormalMatrix
+from jaxvm.solve.buckets import in_order
 from jaxvm.solve.levels import Levels, Tridiagonal
 from jaxvm.solve.robust import Loss, SquaredLoss
 
@@ -43,6 +44,10 @@ class Packets(eqx.Module):
         return self.rows.shape[0] * self.rows.shape[1]
 
 
+_AT_ONCE = 8192
+"""Rows of a table that are looked through at a time."""
+
+
 def pack(factor: Factor, layout: Layout, unknowns: Unknowns) -> Packets:
     """Group the observations of a table by the unknowns that they touch.
 
@@ -50,20 +55,20 @@ def pack(factor: Factor, layout: Layout, unknowns: Unknowns) -> Packets:
     """
     own = np.asarray(factor.slots)[: factor.n_real]
     effects = np.concatenate([layout.all("amplitude"), layout.all("constant")])
-    columns, common = unknowns.column[own], unknowns.column[effects]
-    of_own = np.flatnonzero((columns < unknowns.n).any(axis=0))
-    of_effects = np.flatnonzero(common < unknowns.n)
+    common, free = unknowns.column[effects], unknowns.column < unknowns.n
+    # Some rows at a time, of which most touch little that is free: all would take much room.
+    somewhere = np.zeros(own.shape[1], bool)
+    for first in range(0, len(own), _AT_ONCE):
+        somewhere |= free[own[first : first + _AT_ONCE]].any(axis=0)
+    of_own, of_effects = np.flatnonzero(somewhere), np.flatnonzero(common < unknowns.n)
     live = (*of_own, *(own.shape[1] + of_effects))
-    columns = columns[:, of_own]
+    columns = unknowns.column[own[:, of_own]]
     # Rows that touch the same unknowns have the same sum of hashes.
     hashes = np.random.default_rng(0).integers(1 << 62, size=columns.shape[1], dtype=np.int64)
     _, first, packet = np.unique(columns @ hashes, return_index=True, return_inverse=True)
-    distinct = np.concatenate(
-        [columns[first], np.tile(common[of_effects], (len(first), 1))], axis=1
-    )
     packet = packet.ravel()
-    counts = np.bincount(packet, minlength=len(distinct))
-    order = np.argsort(packet, kind="stable")
+    counts = np.bincount(packet, minlength=len(first))
+    order = in_order(packet, len(first))
     starts = np.concatenate([[0], np.cumsum(counts)])[:-1]
     rank = np.arange(len(packet)) - starts[packet[order]]
     width = _best_width(counts)
@@ -72,9 +77,11 @@ def pack(factor: Factor, layout: Layout, unknowns: Unknowns) -> Packets:
     height = rounded(int(pieces[-1]))
     rows = np.full((height, width), factor.slots.shape[0])
     rows[pieces[packet[order]] + rank // width, rank % width] = order
-    columns = np.full((height, distinct.shape[1]), unknowns.n)
-    columns[: pieces[-1]] = np.repeat(distinct, np.diff(pieces), axis=0)
-    return Packets(jnp.asarray(rows), jnp.asarray(columns), tuple(int(k) for k in live))
+    found = np.full((height, len(live)), unknowns.n)
+    here = found[: pieces[-1]]
+    here[:, : len(of_own)] = columns[np.repeat(first, np.diff(pieces))]
+    here[:, len(of_own) :] = common[of_effects]
+    return Packets(jnp.asarray(rows), jnp.asarray(found), tuple(int(k) for k in live))
 
 
 _SHORT = 0.1

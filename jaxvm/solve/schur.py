@@ -47,26 +47,33 @@ class SchurNormal:
 
     def rescaled(self, scale: Float[np.ndarray, " n"]) -> "SchurNormal":
         """The same for unknowns in other units: x_new = x / scale."""
-        s, groups, d = self.pattern.sizes
-        a, b = jnp.asarray(scale[:s]), jnp.asarray(scale[s:].reshape(groups, d))
-        of_group = padded(b)[self.pattern.group][:, :, None] * self.coupling
-        of_shared, wide = jnp.append(a, 1.0), self.coupling.shape[2]
-        coupling = [
-            view.in_runs(own) * of_shared[_wider(view.columns, wide, s)][:, None, None, :]
-            for view, own in self.pattern.by_table(of_group)
-        ]
-        return replace(
-            self,
-            gradient=self.gradient * scale,
-            shared=self.shared * a[self.pattern.triangle.row] * a[self.pattern.triangle.column],
-            local=b[:, :, None] * self.local * b[:, None, :],
-            coupling=jnp.concatenate([jnp.reshape(own, (-1, d, wide)) for own in coupling]),
-        )
+        blocks = self.gradient, self.shared, self.local, self.coupling
+        gradient, shared, local, coupling = _rescaled(self.pattern, blocks, jnp.asarray(scale))
+        return replace(self, gradient=gradient, shared=shared, local=local, coupling=coupling)
 
     def diagonal(self) -> Float[np.ndarray, " n"]:
         """Diagonal of the matrix."""
         own = jnp.diagonal(self.local, axis1=1, axis2=2)
         return np.concatenate([self.shared[self.pattern.triangle.diagonal], np.ravel(own)])
+
+
+@jax.jit
+def _rescaled(pattern: SchurPattern, blocks, scale):
+    gradient, shared, local, coupling = blocks
+    s, groups, d = pattern.sizes
+    a, b = scale[:s], jnp.reshape(scale[s:], (groups, d))
+    of_group = padded(b)[pattern.group][:, :, None] * coupling
+    of_shared, wide = jnp.append(a, 1.0), coupling.shape[2]
+    found = [
+        view.in_runs(own) * of_shared[_wider(view.columns, wide, s)][:, None, None, :]
+        for view, own in pattern.by_table(of_group)
+    ]
+    return (
+        gradient * scale,
+        shared * a[pattern.triangle.row] * a[pattern.triangle.column],
+        b[:, :, None] * local * b[:, None, :],
+        jnp.concatenate([jnp.reshape(own, (-1, d, wide)) for own in found]),
+    )
 
 
 def schur_normal(problem: Problem, pattern: SchurPattern, x: Float[Array, " n"]) -> SchurNormal:
