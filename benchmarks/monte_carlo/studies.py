@@ -7,7 +7,8 @@ what is known of these is kept either way. Compensation: a camera of `../drift/w
 plate while temperature changes; a model of one time constant is learnt from images that are
 noisier each time, and the drift that it leaves of another day is measured; one after the other by
 the whole `identify`, together by its last adjustment alone. The same trials are drawn either way;
-how far they differ stands in the table. Medians of warm runs, compiling apart. Writes results-studies.json and results-studies.md.
+how far they differ stands in the table. Medians of warm runs, compiling apart. Writes
+results-studies.json and results-studies.md.
 """
 
 import json
