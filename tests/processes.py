@@ -22,11 +22,16 @@ def apart(*arguments, **environment) -> subprocess.Popen:
 
 def together(*arguments) -> list[list[str]]:
     """Work of two processes on loopback, and what the first one says, line by line."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     both = [apart(*arguments, port, rank, 2) for rank in (0, 1)]
     return [answers(own) for own in both][0]
+
+
+def free_port() -> int:
+    """A port that nobody listens at."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return free.getsockname()[1]
 
 
 def answer(process: subprocess.Popen) -> list[str]:

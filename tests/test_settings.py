@@ -7,6 +7,7 @@ from importlib.util import find_spec
 
 import jaxlib.version
 import pytest
+from processes import free_port
 
 
 def flags(**env) -> str:
@@ -69,3 +70,14 @@ def test_what_the_user_sets_stays():
     found = flags(XLA_FLAGS=own)
     assert found.startswith(own) and "cse_barrier_expander" not in found
     assert found.count("--xla_cpu_multi_thread_eigen") == 1
+
+
+@pytest.mark.parametrize("module", ["drift", "scores", "networks", "poses"])
+def test_studies_are_imported_before_jax_begins(module):
+    """In a cluster `jax.distributed.initialize` comes after the imports and before all else."""
+    code = (
+        f"import jaxvm.montecarlo.{module}, jax\n"
+        f"jax.distributed.initialize('127.0.0.1:{free_port()}', 1, 0)"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert said.returncode == 0, said.stderr

@@ -19,7 +19,7 @@ from jaxvm.identify.compensate import moves
 from jaxvm.identify.inputs import Inputs, inputs_of
 from jaxvm.identify.lags import Lags, Padded, Structure, padded, regressors_at
 from jaxvm.identify.model import CameraDrift
-from jaxvm.identify.one_step import ENOUGH, Places, adjusted, is_effects
+from jaxvm.identify.one_step import ENOUGH, Places, adjusted
 from jaxvm.identify.poses import mark_depths
 from jaxvm.montecarlo.estimators import Estimator, LevenbergMarquardt
 from jaxvm.montecarlo.trials import OneByOne, Traced, Trial, fingerprint, name_of
@@ -124,7 +124,7 @@ def structure_study(
         raise ValueError(f"the training can't be adjusted with {structure.name}: {fit.why}")
     problem = scene_problem(fit.scene)
     problem, _ = scaled(problem, normal_at(problem, jnp.zeros(problem.n)))
-    learnt = [_Learnt.of(own, fit.scene, inputs, other) for own in drifts if is_effects(own)]
+    learnt = [_Learnt.of(own, fit.scene, inputs, other) for own in drifts]
     if estimator is None:
         estimator = LevenbergMarquardt(rtol=ENOUGH, damping=_DAMPING)
     trial = _Learning(specialised(problem), learnt, jnp.asarray(drift), noise, estimator)
