@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import equinox as eqx
+import jax
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -29,7 +30,7 @@ from jaxvm.identify.trajectories import (
     _of_epochs,
     trajectories,
 )
-from jaxvm.montecarlo import run
+from jaxvm.montecarlo import LevenbergMarquardt, run
 from jaxvm.montecarlo.drift import compensation_study, structure_study
 from jaxvm.network.residual import residual
 from jaxvm.network.scene import build
@@ -306,11 +307,28 @@ def test_a_study_of_compensation_under_noise():
         structure_study(*days, drift, CONTINUOUS[1])
     with pytest.raises(ValueError, match="drifts do not fit"):
         structure_study(*days, drift[:-1], CONTINUOUS[2])
-    with pytest.raises(ValueError, match="single precision"):
-        structure_study(*days, drift, CONTINUOUS[0]).in_single_precision()
     model = replace(days[1].model, cameras=(replace(days[1].model.cameras[0], name="other"),))
     with pytest.raises(ValueError, match="has no camera left"):
         structure_study(days[0], replace(days[1], model=model), drift, CONTINUOUS[0])
+
+
+def test_drift_models_are_learnt_in_single_precision_too():
+    days, drift = (a_recording(DRIFT, 1), a_recording(DRIFT, 8)), np.zeros((4000, 2))
+
+    def noise(key, shape):
+        """The same numbers in both precisions."""
+        return jax.random.normal(key, shape, np.float32)
+
+    damped = LevenbergMarquardt(rtol=1e-6, damping=1e-6)
+    study = structure_study(*days, drift, CONTINUOUS[2], noise, damped)
+    double, single = (run(own, 0, 4) for own in (study, study.in_single_precision()))
+    assert double.failed == single.failed == 0
+    for name in double.columns:
+        if name.startswith("error"):
+            one, other = double.columns[name], single.columns[name]
+            # What rounding does is little beside what noise does.
+            assert np.abs(one - other).max() < 0.3 * np.std(one), name
+            assert other.dtype == np.float32
 
 
 def test_a_model_survives_its_file(identified, tmp_path):

@@ -12,8 +12,8 @@ from scipy.optimize import least_squares
 
 from jaxvm.solve.adjust import adjust
 from jaxvm.solve.arrow import Arrow, NormalCholesky, factorise
-from jaxvm.solve.optimise import Relaxing
-from jaxvm.solve.problem import normal_at, scaled, scene_problem
+from jaxvm.solve.optimise import Relaxing, gauss_newton, levenberg_marquardt, minimise
+from jaxvm.solve.problem import Normal, normal_at, scaled, scene_problem
 
 NETWORKS = {"epochs": board_recording, "points": free_points_recording}
 """What the local groups are."""
@@ -214,6 +214,28 @@ def test_rejections_in_a_row_damp_faster_and_faster():
     assert accepted and np.isclose(np.log10(size), -5)
     # After a step that was taken patience is what it was.
     assert np.isclose(np.log10(stepped(state, 2.0)[0]), -6)
+
+
+class Ridge:
+    """Half of (x0 + x1 - 1)^2: a valley, whose matrix rounding has made indefinite."""
+
+    def normal(self, x) -> Normal:
+        off = x[0] + x[1] - 1.0
+        matrix = jnp.array([[1.0, 1.0], [1.0, 1.0 - 1e-6]])
+        arrow = Arrow(matrix, jnp.zeros((0, 0, 2)), jnp.zeros((0, 0, 0)))
+        return Normal(0.5 * off**2, off * jnp.ones(2), arrow)
+
+
+def test_a_matrix_without_factors_is_no_convergence():
+    ridge, start = Ridge(), jnp.zeros(2)
+    # No damping helps Gauss-Newton: it says so and does not move.
+    x, last = minimise(ridge, ridge.normal(start), gauss_newton())
+    assert last.done and last.result != optx.RESULTS.successful
+    assert int(last.evaluations) < 5 and np.all(x == 0.0)
+    # Damped steps begin where damping does not help yet, and end in the valley.
+    x, last = minimise(ridge, ridge.normal(start), levenberg_marquardt(damping=1e-11))
+    assert last.done and last.result == optx.RESULTS.successful
+    assert float(x.sum()) == pytest.approx(1.0, abs=1e-4)
 
 
 def test_at_a_solution_one_evaluation_does(network):

@@ -50,6 +50,7 @@ class _State(eqx.Module):
     info: Any
     search: Any
     descent: Any
+    failed: Float[Array, ""]  # step size at which the descent gave no step; infinite where it did
     done: Bool[Array, ""]
     result: optx.RESULTS
     evaluations: Int[Array, ""]
@@ -95,6 +96,8 @@ class NormalEquationSolver(optx.AbstractLeastSquaresSolver):
     a lower cost any more: after a rejection the next step promises no more than that. The cost is
     half a chi-square, so a change of `atol` moves no combination of unknowns by more than
     sqrt(2 atol) of its standard deviation. A last step that promises so little is taken unseen.
+    Where the descent gives no step (a damped matrix that is not positive definite), that counts as
+    a rejected trial; it is a failure where damping grows no further.
     """
 
     rtol: float | Float[Array, ""]
@@ -119,6 +122,7 @@ class NormalEquationSolver(optx.AbstractLeastSquaresSolver):
             info=blank,
             search=self.search.init(y, shape),
             descent=self.descent.init(y, blank),
+            failed=jnp.array(jnp.inf),
             done=jnp.array(False),
             result=optx.RESULTS.successful,
             evaluations=jnp.array(0),
@@ -131,6 +135,8 @@ class NormalEquationSolver(optx.AbstractLeastSquaresSolver):
 
     def advance(self, y, state, info):
         """Accept or reject the trial point by its normal equations, and propose the next one."""
+        # A trial that never left the accepted point would count as a cost that changes no more.
+        info = eqx.tree_at(lambda i: i.f, info, jnp.where(_gave(state), info.f, jnp.inf))
         size, accept, search_result, search = self.search.step(
             state.first, y, state.trial, state.info, info, state.search
         )
@@ -147,9 +153,8 @@ class NormalEquationSolver(optx.AbstractLeastSquaresSolver):
         done = ~state.first & (settled | stuck)
         descent = self.descent.query(y, kept, state.descent)
         change, descent_result = self.descent.step(size, descent)
-        # A damped matrix that is not positive definite gives no step: damp more and try again.
         failed = descent_result != optx.RESULTS.successful
-        hopeless = failed & (size < 1e-12)
+        hopeless = failed & ((size < 1e-12) | (size >= state.failed))
         # What the next step promises, by the quadratic model.
         promised = -jnp.sum(change * (kept.grad + 0.5 * kept.hessian.mv(change)))
         ends = ~failed & (promised <= little)
@@ -163,6 +168,7 @@ class NormalEquationSolver(optx.AbstractLeastSquaresSolver):
             info=kept,
             search=search,
             descent=descent,
+            failed=jnp.where(failed, size, jnp.inf),
             done=done | hopeless | (state.evaluations + 1 >= self.limit),
             result=result,
             evaluations=state.evaluations + 1,
@@ -180,6 +186,11 @@ class NormalEquationSolver(optx.AbstractLeastSquaresSolver):
             "accepted": state.accepted,
             "history": state.history,
         }  # fmt: skip
+
+
+def _gave(state: _State) -> Bool[Array, ""]:
+    """Whether the descent gave the step that leads to the trial."""
+    return jnp.isinf(state.failed)
 
 
 def minimise(
