@@ -10,14 +10,15 @@ from networks import board_recording, predicted, stereo_recording
 
 from jaxvm.discover.accept import STRONG, _is_determined, _is_foretold, accept
 from jaxvm.discover.courses import Course
-from jaxvm.discover.diagnose import _plain_fit
+from jaxvm.discover.diagnose import _plain_fit, diagnose
 from jaxvm.discover.groups import Group
-from jaxvm.discover.heldout import HeldOut, gain, weights_of
+from jaxvm.discover.heldout import HeldOut, gain, hold_out, split, weights_of
 from jaxvm.discover.hypotheses import Hypothesis
 from jaxvm.discover.select import refit
 from jaxvm.physics.catalogue import entries_for
 from jaxvm.physics.catalogue.entry import each
 from jaxvm.physics.effects import Effect, Scope, Term
+from jaxvm.report.words import summary
 from jaxvm.solve.covariance import effect_deviations
 from jaxvm.solve.problem import scene_problem
 
@@ -26,6 +27,8 @@ CAMERA = Scope(camera=("cam",))
 MARKS = each("mark", "target.point_z", numbers=range(30))
 BOARD = Scope(target=("board",))
 ROOM = 64, 8
+FAINT = 6.9e-4
+"""Drift of a focal length (1/s) that all epochs show and two thirds do not."""
 
 
 def named(terms, kind: str, driver: str, form: str, scope: Scope) -> Hypothesis:
@@ -220,3 +223,43 @@ def test_where_nothing_was_held_out_nothing_is_proven(known):
     before = HeldOut(0.0, nothing, nothing, 0.0, known.true_scene())
     found = gain(before, replace(before, range_square=-1.0))
     assert not found.proven and found.probability == 0.0 and found.share == 0.0
+
+
+def test_with_nothing_set_aside_each_third_is_foretold_from_the_others(known):
+    parts, *_ = drawn(known, 0.0, 0)
+    scene = known.true_scene()
+    whole = parts.undivided(scene)
+    fitted = whole.fit(scene)
+    crossed = whole.evaluate(fitted.scene)
+    assert whole.judged.all() and np.array_equal(parts.judged, parts.held)
+    for k in range(3):
+        held = hold_out(scene, offset=k)
+        assert np.array_equal(np.flatnonzero(held), np.arange(k, len(held), 3))
+        part = split(scene, held, parts.sound)
+        alone = part.evaluate(part.fit(scene).scene)
+        np.testing.assert_allclose(crossed.square[held], alone.square, rtol=1e-4)
+        assert np.array_equal(crossed.count[held], alone.count)
+    # An error of a forecast is more than that of a fit.
+    inside = sum(float(np.sum(np.asarray(b) ** 2)) for b in fitted.residuals().pixels)
+    assert crossed.total > inside
+
+
+def test_a_second_look_finds_what_two_thirds_do_not_show(known):
+    """A focal length that drifts: chi-square is expected to drop by 37 in all epochs."""
+    drift = Effect("drift", FOCAL, "time", "linear", (), 0.0, CAMERA, (FAINT,))
+    obs = known.recording.observations
+    still, moving = (
+        predicted(known.true_scene().with_effects(effects, ROOM)) for effects in ((), (drift,))
+    )
+    noise = obs.sigma[:, None] * np.random.default_rng(5).standard_normal(still.shape)
+    nothing, found = (
+        diagnose(replace(known.recording, observations=replace(obs, pixel=pixel + noise)))
+        for pixel in (still, moving)
+    )
+    assert nothing.verdict == "consistent" and not nothing.second_look
+    assert np.array_equal(nothing.held, hold_out(nothing.scene))
+    assert found.second_look and found.held.all()
+    (finding,) = found.findings
+    assert (finding.effect.terms, finding.effect.scope) == (FOCAL, CAMERA)
+    assert finding.p_value <= 0.005 and finding.gain.proven
+    assert "at a second look, with all of them" in summary(found)

@@ -293,14 +293,14 @@ def _on_heldout(heldout: HeldOut, parts: Split, ratio: np.ndarray, length: float
     whitened = np.full((len(scene.recording.observations.epoch), 2), np.nan)
     blocks = residual(scene.state, scene.network).pixels
     for rows, sound, block in zip(scene.tables, parts.sound, blocks, strict=True):
-        held = parts.held[scene.recording.observations.epoch[rows]] & (sound > 0.0)
+        held = parts.judged[scene.recording.observations.epoch[rows]] & (sound > 0.0)
         whitened[rows[held]] = np.asarray(block)[: len(rows)][held]
     marks = _Marks.of(scene, whitened)
     foretold = _Shown.of(marks, ratio, length).foretold
     epoch = scene.recording.observations.epoch[marks.near.rows]
     errors = whitened[marks.near.rows]
     before, after = (
-        np.bincount(epoch, np.sum(e**2, axis=1), len(parts.held))[parts.held]
+        np.bincount(epoch, np.sum(e**2, axis=1), len(parts.judged))[parts.judged]
         for e in (errors, errors - foretold)
     )
     square = heldout.square * after / np.maximum(before, 1e-300)

@@ -83,6 +83,9 @@ def diagnose(
     found, plain, plain_heldout, n_rejected = _searched(
         scene, every, alpha, seed, max_findings, progress
     )
+    if not found.findings:
+        second = _second_look(found, plain, alpha, seed, max_findings, progress)
+        found, plain, plain_heldout = second or (found, plain, plain_heldout)
     parts = found.parts
     current, findings = found.current, found.findings
 
@@ -125,7 +128,8 @@ def diagnose(
         located_left=tuple(locate(final.scene, after)[:8]),
         before=before,
         after=after,
-        held=parts.held,
+        held=parts.judged,
+        second_look=bool(parts.judged.any() and not parts.held.any()),
         heldout_before=plain_heldout,
         heldout_after=heldout,
         scene=final.scene,
@@ -201,6 +205,33 @@ def _searched(
                 return found, plain, heldout, n_rejected
         progress(f"{n} gross errors show beside what was found: beginning again without them")
         parts, n_rejected, plain = cleaner, n, cleaner.fit(scene)
+
+
+def _second_look(
+    found: Search,
+    plain: Adjustment,
+    alpha: float,
+    seed: int,
+    most: int,
+    progress: Callable[[str], None],
+) -> tuple[Search, Adjustment, HeldOut] | None:
+    """The search once more, with all epochs; the plain fit to them and its errors.
+
+    Two thirds of the epochs may not show what all of them do. What is chosen by all of them has
+    each third foretold from the other two, and must be twice as rare under noise. None where
+    nothing is found, or there are too few epochs.
+    """
+    parts = found.parts.undivided(plain.scene)
+    if not parts.judged.any():
+        return None
+    progress("a second look, at all epochs")
+    plain = parts.fit(plain.scene)
+    heldout = parts.evaluate(plain.scene)
+    second = Search(parts, plain, heldout, found.given, 0.5 * alpha, seed)
+    second.run(most, progress)
+    if second.findings:
+        second.settle()
+    return (second, plain, heldout) if second.findings else None
 
 
 def _laid_bare(found: Search) -> tuple[Split, int]:

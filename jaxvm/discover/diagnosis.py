@@ -93,7 +93,8 @@ class Diagnosis:
         left_p_value: its family-wise p-value.
         located_before, located_left: where residuals are large, before and after.
         before, after: residual tables of the plain and the last model (all epochs).
-        held: epochs that were set aside.
+        held: epochs that were set aside; all where each third was foretold from the others.
+        second_look: whether what was found was chosen with all epochs: two thirds did not show it.
         heldout_before, heldout_after: squares by held-out epoch.
         scene: the last model, fitted to all epochs.
         signal: what the marks of an image share at random; None where nothing is proven.
@@ -120,6 +121,7 @@ class Diagnosis:
     before: ResidualTable
     after: ResidualTable
     held: np.ndarray
+    second_look: bool
     heldout_before: HeldOut
     heldout_after: HeldOut
     scene: Scene

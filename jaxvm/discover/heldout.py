@@ -3,6 +3,9 @@
 Whole epochs are set aside before anything is fitted. A model is judged on them with everything held
 that the other epochs determined; only the poses of the held-out epochs themselves are fitted, for
 the plain and the extended model alike.
+
+Where nothing is set aside, each third of the epochs is foretold from the other two (three-fold
+cross-validation): what was chosen has seen them then, its numbers have not.
 """
 
 from dataclasses import dataclass, replace
@@ -17,6 +20,9 @@ from jaxvm.solve.covariance import amplitude_covariance
 CONFIRMED = 0.8
 """Bootstrap probability of an improvement on held-out epochs with which a finding is claimed."""
 
+
+_EVERY = 3
+"""Of so many epochs one is set aside."""
 
 _RTOL = 1e-7
 """Relative change of the cost at which a fit ends: a hundredth of a chi-square of 10^5.
@@ -124,9 +130,21 @@ class Split:
             return fit(constants_held(scene))
         return fitted
 
+    @property
+    def judged(self) -> np.ndarray:
+        """True for the epochs that models are judged on: those set aside, or all."""
+        crossed = not self.held.any() and len(self.held) >= _EVERY
+        return self.held | crossed
+
     def evaluate(self, scene: Scene) -> HeldOut:
-        """Errors of a fitted scene on the epochs set aside."""
-        return evaluate(scene, self.held, self.sound)
+        """Errors of a fitted scene on the epochs set aside, or of each third from the others."""
+        if self.held.any() or not self.judged.any():
+            return evaluate(scene, self.held, self.sound)
+        found = []
+        for k in range(_EVERY):
+            part = split(scene, hold_out(scene, offset=k), self.sound)
+            found.append((part.held, part.evaluate(part.fit(scene).scene)))
+        return _together(found, scene)
 
     def proven(self, fitted: Adjustment) -> tuple[Adjustment, HeldOut]:
         """The fit with the epochs set aside evaluated, and their poses taken over."""
@@ -173,11 +191,11 @@ def split(scene: Scene, held: np.ndarray, sound: tuple[np.ndarray, ...]) -> Spli
     return Split(held, sound, weights_of(scene, ~held, sound), range_weights_of(scene, ~held))
 
 
-def hold_out(scene: Scene, every: int = 3) -> np.ndarray:
+def hold_out(scene: Scene, every: int = _EVERY, offset: int = -1) -> np.ndarray:
     """Epochs set aside: every third one (or every n-th), True where held out."""
     if every < 2:
         raise ValueError(f"every n-th epoch is held out with n at least 2, not {every}")
-    return np.arange(len(scene.recording.time)) % every == every - 1
+    return np.arange(len(scene.recording.time)) % every == offset % every
 
 
 def weights_of(scene: Scene, epochs: np.ndarray, sound: tuple[np.ndarray, ...]):
@@ -219,6 +237,16 @@ def evaluate(scene: Scene, held: np.ndarray, sound: tuple[np.ndarray, ...]) -> H
             tried = _evaluate(other, held, sound)
             shown = tried if tried.total < shown.total else shown
     return shown
+
+
+def _together(parts: list[tuple[np.ndarray, HeldOut]], scene: Scene) -> HeldOut:
+    """Errors on epochs that were set aside in turn, as of one scene."""
+    square, count = np.zeros(len(parts[0][0])), np.zeros(len(parts[0][0]))
+    for held, errors in parts:
+        square[held], count[held] = errors.square, errors.count
+    rms = float(np.sqrt(square.sum() / max(count.sum(), 1.0)))
+    ranges = sum(errors.range_square for _, errors in parts)
+    return HeldOut(rms * reference_sigma(scene), square, count, ranges, scene)
 
 
 def _evaluate(scene: Scene, held: np.ndarray, sound: tuple[np.ndarray, ...]) -> HeldOut:

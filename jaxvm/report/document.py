@@ -47,6 +47,7 @@ def document(diagnosis: Diagnosis) -> dict[str, Any]:
         "located_before": [vars(place) for place in diagnosis.located_before],
         "n_hypotheses": diagnosis.n_hypotheses,
         "n_rejected": diagnosis.n_rejected,
+        "second_look": diagnosis.second_look,
         "heldout_epochs": diagnosis.recording.epoch_ids[diagnosis.held].tolist(),
         "smallest_visible": {
             name: {"amplitude": value, "unit": unit}

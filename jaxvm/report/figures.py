@@ -153,7 +153,9 @@ def heldout_quality(diagnosis: Diagnosis) -> Figure:
     left.bar_label(bars, fmt="%.3f", padding=2)
     left.axhline(diagnosis.noise_px, color=INK, ls=":", lw=1.0, label="noise, robust")
     left.set_xticks(range(len(steps)), [n for n, _ in steps], rotation=30 if len(steps) > 3 else 0)
-    left.set(ylabel="held-out RMS (px)", title="epochs that were never fitted")
+    crossed = "each third foretold from the others"
+    title = crossed if diagnosis.second_look else "epochs that were never fitted"
+    left.set(ylabel="held-out RMS (px)", title=title)
     left.margins(y=0.35)
     left.legend(loc="upper right")
     ids = diagnosis.recording.epoch_ids[diagnosis.held]

@@ -318,7 +318,7 @@ def explanation(finding: Finding) -> str:
         return entries[0].explanation
     return (
         "No named effect explains this. The best port and driver are given with a free-form or "
-        "simple course; it is not in the catalogue, but it improves epochs that were never fitted."
+        "simple course; it is not in the catalogue, but it improves epochs that were not fitted."
     )
 
 
@@ -333,7 +333,8 @@ def verdict_sentence(diagnosis: Diagnosis) -> str:
         )
     if diagnosis.verdict == "explained":
         found = _count(_n_found(diagnosis))
-        return f"{found}; after that none of {tried} is significant (family-wise {p})."
+        looks = _looks(diagnosis)
+        return f"{found}; after that none of {tried} is significant (family-wise {p}).{looks}"
     left = f"Something significant is left ({p})"
     if diagnosis.likeness > ALIKE and diagnosis.signal is None:
         left = (
@@ -348,7 +349,17 @@ def verdict_sentence(diagnosis: Diagnosis) -> str:
         )
     if diagnosis.verdict == "unexplained":
         return f"The recording differs from its model, but nothing passes the proof. {left}."
-    return f"{_count(_n_found(diagnosis))}. {left}."
+    return f"{_count(_n_found(diagnosis))}. {left}.{_looks(diagnosis)}"
+
+
+def _looks(diagnosis: Diagnosis) -> str:
+    """How it was chosen, where not with the fitted epochs alone."""
+    if not diagnosis.second_look:
+        return ""
+    return (
+        " Fewer epochs do not show it: it was chosen at a second look, with all of them, and each "
+        "third was then foretold from the other two."
+    )
 
 
 def _n_found(diagnosis: Diagnosis) -> int:
