@@ -162,8 +162,8 @@ def test_what_was_found_keeps_its_constants_free_beside_a_new_one(recorded):
 # --- stairs and plays -----------------------------------------------------------------------------
 
 
-def with_hidden(form, constants, terms, amplitudes, scope):
-    """A board with something hidden that follows the logged air, without it in the model.
+def with_hidden(form, constants, terms, amplitudes, scope, driver="ambient_degC"):
+    """A board with something hidden, that follows the logged air or nothing, not in the model.
 
     Its camera is so quiet that little is enough, and the model is as good as linear in it.
     """
@@ -173,7 +173,7 @@ def with_hidden(form, constants, terms, amplitudes, scope):
     air = 20.0 + 6.0 * np.sin(9.0 * t / span) + 2.0 * np.sin(31.0 * t / span)
     drivers = Drivers(t, {"ambient_degC": air})
     plain = known.true_scene(replace(known.recording, drivers=drivers))
-    own = Effect("it", terms, "ambient_degC", form, constants, 20.0, scope, amplitudes)
+    own = Effect("it", terms, driver, form, constants, 20.0, scope, amplitudes)
     truth = plain.with_effects((own,), (8, 4))
     obs = known.recording.observations
     obs = replace(obs, sigma=0.1 * obs.sigma)
@@ -214,6 +214,23 @@ def test_constants_are_found_between_points_of_the_grid(form, constants, terms, 
     assert best[1] > own[1] + 5.0
     assert best[0].course.constants[0] == pytest.approx(constants[0], rel=0.05)
     assert said(best[0]) in about
+
+
+def test_seams_of_a_sensor_are_found_between_those_of_the_grid():
+    """Three fields, the outer two shifted by a tenth of a pixel against the middle one."""
+    seams, shifts = (-0.09, 0.17), (0.1, -0.05, -0.12, 0.08)
+    terms = tuple(
+        Term(f"detect.{axis}", "column", "step", (at,)) for at in seams for axis in "uv"
+    )  # fmt: skip
+    scene = with_hidden("constant", (), terms, shifts, Scope(camera=("cam",)), "constant")
+    parts, plain, _ = _plain_fit(scene, 3)
+    search = Search(parts, *parts.proven(plain), 0)
+    search.run(3, lambda line: None)
+    (found,) = search.findings
+    assert found.hypothesis.entries[0].id == "sensor-stitched"
+    nearest = sorted({*(term.constants[0] for term in found.hypothesis.group.terms)})
+    assert np.abs(np.array(nearest) - seams).max() < 0.0151
+    np.testing.assert_allclose(found.effect.amplitudes, shifts, atol=0.03)
 
 
 @pytest.mark.parametrize("flat_at, form", [(21.27, "linear"), (0.0, "affine")])

@@ -2,7 +2,8 @@
 
 The grid of all hypotheses is coarse. A step in a gap beside the true one is wrong in all the epochs
 between, and what settles slowly from there on would then fit better than the step itself. Stairs
-with one edge in a wrong place lose to those of another thermometer.
+with one edge in a wrong place lose to those of another thermometer. Where the fields of a sensor
+join a little beside the seam of the grid, the strip between is wrong in all images.
 """
 
 from dataclasses import replace
@@ -11,6 +12,7 @@ from itertools import product
 import numpy as np
 
 from jaxvm.discover.courses import ENDS, Course, gaps
+from jaxvm.discover.groups import Group
 from jaxvm.discover.hypotheses import Family, Hypothesis
 from jaxvm.discover.ranking import Ranking, Scores, where
 from jaxvm.discover.score import ScoreTests
@@ -30,6 +32,9 @@ _REACH = 2
 
 _HEIGHTS_OF_STAIRS, _PHASES = 80, 64
 """Heights and phases of stairs that are tried, all over the grid."""
+
+_SHIFTS = tuple(round(0.01 * k, 2) for k in range(-3, 4))
+"""Places beside a seam on the grid that are tried, in image widths."""
 
 _HALVES, _CONTACTS = 33, 9
 """Half plays between the neighbours of the best on the grid, and first contacts."""
@@ -51,8 +56,46 @@ def at_finer_constants(
         if best is not None and better >= own:
             (hypothesis, _, amplitudes), own = best, better
             finer[said(hypothesis)] = about
+        hypothesis, own, amplitudes = _at_finer_seams(
+            (hypothesis, own, amplitudes), tests, ranking, weigh
+        )
         found.append((hypothesis, own, amplitudes))
     return sorted(found, key=lambda item: -item[1]), finer
+
+
+def _at_finer_seams(
+    item: tuple[Hypothesis, float, np.ndarray], tests: ScoreTests, ranking: Ranking, weigh: Weighing
+) -> tuple[Hypothesis, float, np.ndarray]:
+    """A hypothesis with seams where they fit best, its evidence and amplitudes; or as it was."""
+    hypothesis, own, _ = item
+    groups = _with_seams_moved(hypothesis.group)
+    for scores, g, places, s in where(ranking, hypothesis, tests.scene) if groups else ():
+        family = of_courses(scores.family, (g, places[0], s), (hypothesis.course,))
+        valid = np.repeat(family.valid, len(groups), axis=0)
+        moved = replace(family, groups=groups, valid=valid)
+        for about in tests.about((moved,)).score(weigh.variance).scores:
+            drop = np.where(about.valid, about.drop, -np.inf)[:, 0, s]
+            best = int(np.argmax(drop))
+            better = replace(hypothesis, group=groups[best])
+            amplitudes = about.amplitude[best, 0, s]
+            evidence = weigh(better, float(drop[best]), amplitudes)
+            if evidence > own:
+                return better, evidence, amplitudes
+    return item
+
+
+def _with_seams_moved(group: Group) -> tuple[Group, ...]:
+    """The group with each seam at several places beside its own; none where it has no seams."""
+    if any(term.basis != "step" or term.driver not in ("column", "row") for term in group.terms):
+        return ()
+    seams = [term.constants for term in group.terms]
+    each = sorted({*seams})
+    ways = product(*([(round(at + by, 2),) for by in _SHIFTS] for (at,) in each))
+    moved = [dict(zip(each, way, strict=True)) for way in ways if list(way) == sorted({*way})]
+    return tuple(
+        replace(group, terms=tuple(replace(t, constants=places[t.constants]) for t in group.terms))
+        for places in moved
+    )
 
 
 def said(hypothesis: Hypothesis) -> tuple:

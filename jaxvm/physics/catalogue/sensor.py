@@ -1,5 +1,7 @@
 """Named physics of sensors, shutters and clocks."""
 
+from itertools import combinations
+
 from jaxvm.physics.catalogue.entry import (
     ALWAYS,
     HYSTERESIS,
@@ -17,6 +19,11 @@ SEAMS = tuple(round(0.04 * k, 2) for k in range(-8, 9))
 """Where the fields of a stitched sensor may join, in image widths from the middle."""
 
 _CENTRE, _DELAY = pair("sensor.cx", "sensor.cy"), (plain("clock.offset"),)
+
+
+def _steps(axes: str, along: str, *seams: float):
+    """Fields of a sensor that are shifted against each other from one seam on, or from each."""
+    return tuple(Term(f"detect.{axis}", along, "step", (seam,)) for seam in seams for axis in axes)
 
 
 def _sloped(basis: str):
@@ -120,16 +127,15 @@ SENSOR: tuple[Entry, ...] = (
     ),
     Entry(
         "sensor-stitched", "the sensor is stitched", (57,),
-        tuple(
-            tuple(Term(f"detect.{axis}", along, "step", (seam,)) for axis in own)
-            for along, seams in (("column", SEAMS), ("row", (0.0,)))
-            for seam in seams
-            for own in ("uv", "u", "v")
+        (
+            *(_steps(axes, "column", seam) for seam in SEAMS for axes in ("uv", "u", "v")),
+            *(_steps(axes, "row", 0.0) for axes in ("uv", "u", "v")),
+            *(_steps("uv", "column", *two) for two in combinations(SEAMS, 2)),
         ),
         ALWAYS, ALWAYS, "camera",
         (5e-4, 1e-1), "pixel locking, unflat sensor", "move a target across the middle",
-        "The sensor was exposed in two fields that do not quite fit, or its halves are read out "
-        "apart. One half of the image is shifted against the other.",
+        "The sensor was exposed in two or three fields that do not quite fit, or its halves are "
+        "read out apart. One part of the image is shifted against the other.",
     ),
     Entry(
         "image-resampled", "the device resamples its image from a moment on", (63,),
