@@ -333,6 +333,24 @@ def test_distortion_by_range_by_hand():
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
+def test_place_of_a_mark_above_and_beside_the_camera_by_hand():
+    known = board_recording(noise=0.0, n_epochs=2)
+    scene, obs = known.true_scene(), known.recording.observations
+    rows = scene.tables[0]
+    table = np.asarray(observation_driver_table(scene, scene.network.pixels[0], rows))[: len(rows)]
+    pose = known.truth["carrier_from_target"][obs.epoch[rows]]
+    marks = known.recording.model.targets[0].points[obs.point[rows]]
+    world = Rotation.from_rotvec(pose[:, :3]).apply(marks) + pose[:, 3:]
+    up = np.array(known.recording.model.up) / np.linalg.norm(known.recording.model.up)
+    level_x, level_y, height = (
+        table[:, OBSERVATION_DRIVER_INDEX[name]] for name in ("level_x", "level_y", "height")
+    )
+    np.testing.assert_allclose(height, world @ up, rtol=1e-9, atol=1e-12)
+    # The other two are level, and the three are lengths along axes at right angles.
+    flat = world - (world @ up)[:, None] * up
+    np.testing.assert_allclose(level_x**2 + level_y**2, np.sum(flat**2, axis=1), rtol=1e-9)
+
+
 # --- patterns over distances ----------------------------------------------------------------------
 
 

@@ -17,7 +17,7 @@ from jaxvm.network.network import Network
 from jaxvm.network.residual import parts_of
 from jaxvm.network.tables import Tables
 from jaxvm.physics.blocks import by_blocks, roomy
-from jaxvm.physics.chain import Aim, Sight
+from jaxvm.physics.chain import Aim, Sight, level_axes
 from jaxvm.physics.drivers import all_observation_drivers, all_range_drivers, patterns
 from jaxvm.physics.effects import Effect, Scope, courses
 from jaxvm.physics.ports import PORTS, PortValues
@@ -109,17 +109,17 @@ def observation_driver_table(scene: Scene, factor: PixelFactor, rows: np.ndarray
     sizes = np.array([c.image_size for c in scene.model.cameras], float)
     padded = np.append(rows, np.full(factor.slots.shape[0] - len(rows), rows[-1]))
     size = sizes[scene.recording.observations.camera[padded]]
-    up = jnp.asarray(scene.model.up, float)
-    return by_blocks(_driver_table, (factor.untiled(), size), roomy(scene.state.flatten()), up)
+    level = jnp.asarray(level_axes(scene.model.up))
+    return by_blocks(_driver_table, (factor.untiled(), size), roomy(scene.state.flatten()), level)
 
 
 @program
-def _driver_table(table: tuple[PixelFactor, Array], flat, up):
+def _driver_table(table: tuple[PixelFactor, Array], flat, level):
     factor, size = table
     own = parts_of(factor, flat)
     plain = jax.vmap(lambda o, at: factor.local(o, at, PortValues()) + at.pixel)
     predicted = plain(own, factor.circumstances)
-    return all_observation_drivers(Sight(*own), factor.circumstances, predicted, size, up)
+    return all_observation_drivers(Sight(*own), factor.circumstances, predicted, size, level)
 
 
 def range_driver_table(scene: Scene, factor: RangeFactor):

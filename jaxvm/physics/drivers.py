@@ -52,6 +52,9 @@ OBSERVATION_DRIVERS: dict[str, str] = {
     "target_up_y": "1",
     "target_up_z": "1",
     "radius2_over_range": "half diagonal²/m",
+    "level_x": "m",
+    "level_y": "m",
+    "height": "m",
 }
 """Observation-like drivers and their units."""
 
@@ -118,7 +121,7 @@ def observation_drivers(
     circumstances: Circumstances,
     predicted: Float[Array, "2"],
     image_size: Float[Array, "2"],
-    up: Float[Array, "3"],
+    level: Float[Array, "3 3"],
 ) -> Float[Array, " drivers"]:
     """All observation-like drivers of one observation, in the order of OBSERVATION_DRIVERS.
 
@@ -126,7 +129,8 @@ def observation_drivers(
     `row` and `column` from the middle of the image; `incidence` is the angle between the line of
     sight and the target's normal; `checker` is +1 and -1 in turn over the marks of a grid, NaN
     without one; `mark` is the number of the mark among all targets', `epoch` that of the epoch;
-    `along_beam` goes from -1 to 1 over a station's cameras.
+    `along_beam` goes from -1 to 1 over a station's cameras; `level_x`, `level_y` and `height` are
+    how far the mark is from the camera along the `level` axes (`chain.level_axes`).
     """
     at = circumstances
     world_from_target = sight.world_from_target
@@ -139,8 +143,9 @@ def observation_drivers(
     ray = mark_cam / distance
     normal = camera_from_world.rotation @ world_from_target.rotation[:, 2]
     cosine = normal @ ray
-    up_cam = camera_from_world.rotation @ up
-    up_target = world_from_target.rotation.T @ up
+    up_cam = camera_from_world.rotation @ level[:, 2]
+    up_target = world_from_target.rotation.T @ level[:, 2]
+    from_camera = level.T @ (world_from_camera.rotation @ mark_cam)
 
     arm_world = world_from_target.rotation @ sight.point
     speed = camera_from_world.rotation @ (at.velocity[:3] + jnp.cross(at.velocity[3:], arm_world))
@@ -179,6 +184,9 @@ def observation_drivers(
             up_target[1],
             up_target[2],
             radius**2 / distance,
+            from_camera[0],
+            from_camera[1],
+            from_camera[2],
         ]
     )
 

@@ -6,11 +6,11 @@ from jaxvm.physics.effects import Term
 
 _AIR = ("constant", "gradient", "temperature", "irradiance")
 _AIR_FORMS = ("constant", "linear", "proportional", "lag", "lag with state")
-_LAYERS = (Term("medium.layers_up"), Term("medium.layers_up", "image_y", "linear"))
+_LAYERS = (Term("medium.layers_up"), Term("medium.layers_up", "height", "linear"))
 """Warm air over the ground: rays that pass lower bend more."""
 
 _WALLS = tuple(
-    (Term(f"medium.layers_{axis}"), Term(f"medium.layers_{axis}", "image_x", "linear"))
+    (Term(f"medium.layers_{axis}"), Term(f"medium.layers_{axis}", f"level_{axis}", "linear"))
     for axis in "xy"
 )
 """Warm air along a wall: rays that pass nearer bend more."""
