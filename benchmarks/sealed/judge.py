@@ -159,6 +159,7 @@ def _effect(
         "decidable": is_shown and all(gap >= DECIDED for gap in gaps.values()),
         "decidable_by_names": is_shown and bool(ahead >= DECIDED),
         "decidable_priced": is_shown and bool(priced >= DECIDED),
+        "affordable": is_shown and bool(priced >= -DECIDED),
         "detected": bool(found),
         "in_set": any(any(own) for own in right),
         "first": bool(first) and (first[0] if only else any(first)),

@@ -134,6 +134,10 @@ def figures(rows: list[dict]) -> list[Figure]:
             [e["in_set"] for _, e in shown], 0.97,
         ),
         _share(
+            "1a", "the same where unknowns, priced at ln n each, do not rule the right name out",
+            [e["in_set"] for _, e in shown if e["affordable"]], 0.0,
+        ),
+        _share(
             "2", "named first where decidable", [e["first"] for _, e in ones if e["decidable"]],
             0.95,
         ),
