@@ -292,3 +292,16 @@ def test_a_refit_goes_on_until_the_camera_has_made_room():
     assert drop > most - 1.0
     (size,) = candidate.amplitudes
     assert abs(size - 0.15) < 0.03
+
+
+def test_a_seam_costs_as_much_as_an_instant():
+    def stitched(*seams):
+        terms = tuple(Term(f"detect.{a}", "column", "step", (at,)) for at in seams for a in "uv")
+        entries = entries_for(terms, "camera", ("constant",), "constant")
+        return Hypothesis(Group(terms, "camera"), Course("constant", "constant"), Scope(), entries)
+
+    for n, seams in ((1, (0.04,)), (2, (-0.12, 0.2))):
+        expected = n * np.log(5000)
+        assert price_of_constants(stitched(*seams), 300.0, 5000) == pytest.approx(expected)
+    instant = replace(DRIFT, course=Course("time", "step", (7.0,)))
+    assert price_of_constants(instant, 300.0, 5000) == pytest.approx(np.log(5000))

@@ -194,11 +194,14 @@ def price_of_constants(hypothesis: Hypothesis, drop: float, n: int) -> float:
     """What the constants of a hypothesis cost.
 
     Each that is refined costs what the drop lets it be known by (Laplace): next to nothing where
-    any value does, as much as a column where one value alone does.
+    any value does, as much as a column where one value alone does. Seams, where the fields of a
+    sensor join, are sought like instants, and cost as much.
     """
     own = FORMS[hypothesis.course.form].constants[: len(hypothesis.course.constants)]
     refined = min(np.log1p(_SHARP * max(drop, 0.0)), np.log(n))
-    return float(sum(refined if constant.refined else np.log(n) for constant in own))
+    seams = {term.constants for term in hypothesis.group.terms if term.basis == "step"}
+    known = sum(refined if constant.refined else np.log(n) for constant in own)
+    return float(known + len(seams) * np.log(n))
 
 
 def spread_of(
