@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from networks import board_recording, predicted, stereo_recording
 
-from jaxvm.discover.accept import STRONG, _is_determined, _is_foretold, accept
+from jaxvm.discover.accept import STRONG, _is_foretold, accept, is_determined
 from jaxvm.discover.courses import Course
 from jaxvm.discover.diagnose import _plain_fit, diagnose
 from jaxvm.discover.groups import Group
@@ -189,7 +189,7 @@ def test_what_no_epoch_shows_has_no_size(known):
     unseen = parts.fit(before.scene.with_effects((late,), (16, 8)))
     for candidate, determined in ((found, True), (replace(found, adjustment=unseen), False)):
         shown = parts.evaluate(candidate.adjustment.scene)
-        assert _is_determined(candidate, shown) is determined
+        assert is_determined(candidate, shown) is determined
 
 
 def test_an_image_that_was_never_taken_needs_no_amount():
@@ -210,7 +210,7 @@ def test_an_image_that_was_never_taken_needs_no_amount():
     completed = replace(candidate.adjustment, scene=shown.scene)
     sized = np.isfinite(effect_deviations(completed)[-1])
     assert sized.sum() == len(terms) - 2
-    assert _is_determined(candidate, shown)
+    assert is_determined(candidate, shown)
 
 
 def drawn_odds(known, per_second, seed):

@@ -11,6 +11,7 @@ from jaxvm.discover.diagnose import ROOM, _plain_fit
 from jaxvm.discover.hypotheses import FREE
 from jaxvm.discover.pairs import WIDE, better_pair, other_beginnings, worth_a_second_thought
 from jaxvm.discover.score import ScoreTests
+from jaxvm.discover.search import Search
 from jaxvm.discover.select import Weighing, refit, shortlist
 from jaxvm.discover.space import enumerate_hypotheses
 from jaxvm.network.scene import build
@@ -42,7 +43,7 @@ def finding(before, candidate):
     return SimpleNamespace(hypothesis=candidate.hypothesis, drop=drop, effect=candidate.effect)
 
 
-def test_a_wide_name_gives_way_to_two_narrow_ones(two):
+def test_a_wide_name_gives_way_to_two_narrow_ones(two, monkeypatch):
     parts, plain, tests = two
     variance = robust_variance(plain)
     ranking = tests.score(variance)
@@ -66,6 +67,11 @@ def test_a_wide_name_gives_way_to_two_narrow_ones(two):
     # Against themselves the two are no better.
     own = [finding(plain, pair[0]), finding(pair[0].adjustment, pair[1])]
     assert better_pair(plain, last, own, others, tests, parts) is None
+    # They take its place where they have a size.
+    search = Search(parts, *parts.proven(plain), 0)
+    assert search._may_replace(pair[1])
+    monkeypatch.setattr("jaxvm.discover.search.is_determined", lambda *_: False)
+    assert not search._may_replace(pair[1])
 
 
 def test_a_narrow_name_alone_needs_no_second_thought():

@@ -105,7 +105,7 @@ def accept(
             if ask_odds and strong and proof.share > 0.0 and not proof.proven:
                 after = replace(candidate.adjustment, scene=shown.scene)
                 proof = replace(proof, odds=split.odds(current, in_all(), after))
-            if proof.proven and _is_determined(candidate, shown):
+            if proof.proven and is_determined(candidate, shown):
                 near = _close_behind(candidate, refitted)
                 return Accepted(candidate, near, shown, proof, tuple(_comparable(tried, current)))
             hopeless.add(_key(candidate.hypothesis))
@@ -161,7 +161,7 @@ def _is_foretold(candidate: Candidate) -> bool:
     return len(candidate.amplitudes) <= FREE or bool(candidate.hypothesis.entries and not amounts)
 
 
-def _is_determined(candidate: Candidate, shown: HeldOut) -> bool:
+def is_determined(candidate: Candidate, shown: HeldOut) -> bool:
     """Whether the fit, completed by the held-out epochs, has a size for what it added.
 
     An image or a mark that was never seen has no amount of its own, and needs none.

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from jaxvm.discover.accept import Accepted, accept, alternatives, as_good, short
+from jaxvm.discover.accept import Accepted, accept, alternatives, as_good, is_determined, short
 from jaxvm.discover.curved import with_curved
 from jaxvm.discover.detail import with_detail
 from jaxvm.discover.diagnosis import Finding
@@ -92,7 +92,7 @@ class Search:
             progress("trying pairs of other effects")
             others = other_beginnings(first, plain, self.findings[0].hypothesis, self.parts.n)
             pair = better_pair(plain, self.current, self.findings, others, self._tests, self.parts)
-            if pair is not None and self._as_good_on_heldout(pair[1]):
+            if pair is not None and self._may_replace(pair[1]):
                 self.current, self.heldout, self.findings = plain, heldout, []
                 self._hopeless, self._superfluous = set(), set()
                 self._take_pair(pair, progress)
@@ -242,9 +242,11 @@ class Search:
         self._hopeless = set(self._superfluous)
         self.findings = self._confirmed()
 
-    def _as_good_on_heldout(self, candidate: Candidate) -> bool:
+    def _may_replace(self, candidate: Candidate) -> bool:
+        """Whether a fit is as good on the held-out epochs as what was found, and determined."""
         shown = self.parts.evaluate(candidate.adjustment.scene)
-        return shown.rms_px <= WORSE * self.heldout.rms_px
+        as_good = shown.rms_px <= WORSE * self.heldout.rms_px
+        return as_good and is_determined(candidate, shown)
 
     def _take_pair(self, pair, progress: Callable[[str], None]) -> None:
         """Take hypotheses that were fitted already, as if each had led, while they are significant.
