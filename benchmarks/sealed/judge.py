@@ -234,7 +234,7 @@ def _sizes(truth: dict, finding: dict, facts: Facts) -> dict:
         constants[name] = (own[0] + offset - told[name]) / own[1]
     z = []
     for port, value in _shown_values(truth, finding).items():
-        true = _in_units_of(finding, value, told)
+        true = _in_units_of(finding, value, told, driver)
         z.append(None if true is None else _deviation(port, true, finding, 80 in truth["rows"]))
     words = "not all sizes have one number to compare" if None in z else ""
     return {
@@ -256,11 +256,14 @@ def _shown_values(truth: dict, finding: dict) -> dict[str, float]:
     return values
 
 
-def _in_units_of(finding: dict, value: float, told: dict) -> float | None:
+def _in_units_of(finding: dict, value: float, told: dict, driver: str) -> float | None:
     """A true size per unit of the driver; the key gives what grows in time at its end.
 
-    What settles has no rate. A quantity less its own lag is the time constant times its rate.
+    What settles has no rate. A quantity less its own lag is the time constant times its rate. What
+    warms up by 1 - exp(-s / tau) since power-on fades by exp(-s / tau) with the other sign.
     """
+    if driver == "power-on" and "tau2_s" not in told and finding.get("form") == "fading":
+        return -value
     if ("end_s" in told) != (finding.get("form") == "ramp"):
         return None
     if "end_s" in told:

@@ -295,6 +295,26 @@ def test_a_size_is_compared_with_a_rate_only_where_the_key_tells_its_end():
     assert len(_sizes(settled, {**ramp, "form": "settling"}, FACTS)["z"]) == 1
 
 
+def test_what_warms_up_fades_with_the_other_sign():
+    """a (1 - exp(-s / tau)) and -a exp(-s / tau) differ by what never changes."""
+    size = {"port": "sensor.focal", "name": "sensor.focal", "value": 6.2e-4, "std": 1e-5}
+    where = {"camera": ["left"]}
+    fades = {
+        "driver": "time since power-on of left", "form": "fading", "where": where,
+        "parameters": [size],
+    }  # fmt: skip
+    warms = {
+        "rows": [52], "driver": "power-on", "where": where, "values": {"sensor.focal": -6.3e-4},
+        "constants": {"tau_s": 900.0},
+    }  # fmt: skip
+    assert _sizes(warms, fades, FACTS)["z"] == [pytest.approx(-1.0)]
+    onset = {**fades, "form": "onset", "parameters": [{**size, "value": -6.2e-4}]}
+    assert _sizes(warms, onset, FACTS)["z"] == [pytest.approx(1.0)]
+    # What the key itself gives as fading has two time constants.
+    two = {**warms, "values": {"sensor.focal": 6.3e-4}, "constants": {"tau_s": 9.0, "tau2_s": 1.0}}
+    assert _sizes(two, fades, FACTS)["z"] == [pytest.approx(-1.0)]
+
+
 @pytest.mark.parametrize("tau", [4.0, 45.0, 2000.0])
 def test_lags_of_the_world_are_the_differential_equation(tau):
     t = heat.STEP * np.arange(60)
