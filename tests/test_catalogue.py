@@ -316,24 +316,9 @@ def test_what_a_recording_lacks_is_not_asked():
         assert family.valid.any(axis=(1, 2)).all() and len(family.groups) == len(family.valid)
 
 
-def test_distortion_by_range_by_hand():
-    """The square of the radius in the image over the slanted distance of the mark."""
-    known = board_recording(noise=0.0, n_epochs=2)
-    scene, obs = known.true_scene(), known.recording.observations
-    rows = scene.tables[0]
-    table = np.asarray(observation_driver_table(scene, scene.network.pixels[0], rows))[: len(rows)]
-    pose = known.truth["carrier_from_target"][obs.epoch[rows]]
-    marks = known.recording.model.targets[0].points[obs.point[rows]]
-    distance = np.linalg.norm(Rotation.from_rotvec(pose[:, :3]).apply(marks) + pose[:, 3:], axis=1)
-    from_centre = obs.pixel[rows] - known.truth["centre"][0]
-    (camera,) = known.recording.model.cameras
-    half = 0.5 * np.linalg.norm(camera.image_size)
-    expected = np.sum((from_centre / half) ** 2, axis=1) / distance
-    found = table[:, OBSERVATION_DRIVER_INDEX["radius2_over_range"]]
-    np.testing.assert_allclose(found, expected, rtol=1e-9)
-
-
-def test_place_of_a_mark_above_and_beside_the_camera_by_hand():
+@pytest.fixture(scope="module")
+def seen():
+    """Known board before a camera at the origin, drivers by name, and marks in the world (m)."""
     known = board_recording(noise=0.0, n_epochs=2)
     scene, obs = known.true_scene(), known.recording.observations
     rows = scene.tables[0]
@@ -341,10 +326,25 @@ def test_place_of_a_mark_above_and_beside_the_camera_by_hand():
     pose = known.truth["carrier_from_target"][obs.epoch[rows]]
     marks = known.recording.model.targets[0].points[obs.point[rows]]
     world = Rotation.from_rotvec(pose[:, :3]).apply(marks) + pose[:, 3:]
+    return known, dict(zip(OBSERVATION_DRIVER_INDEX, table.T, strict=True)), rows, world
+
+
+def test_distortion_by_range_by_hand(seen):
+    """The square of the radius in the image over the slanted distance of the mark."""
+    known, drivers, rows, world = seen
+    obs = known.recording.observations
+    distance = np.linalg.norm(world, axis=1)
+    from_centre = obs.pixel[rows] - known.truth["centre"][0]
+    (camera,) = known.recording.model.cameras
+    half = 0.5 * np.linalg.norm(camera.image_size)
+    expected = np.sum((from_centre / half) ** 2, axis=1) / distance
+    np.testing.assert_allclose(drivers["radius2_over_range"], expected, rtol=1e-9)
+
+
+def test_place_of_a_mark_above_and_beside_the_camera_by_hand(seen):
+    known, drivers, _, world = seen
     up = np.array(known.recording.model.up) / np.linalg.norm(known.recording.model.up)
-    level_x, level_y, height = (
-        table[:, OBSERVATION_DRIVER_INDEX[name]] for name in ("level_x", "level_y", "height")
-    )
+    level_x, level_y, height = (drivers[name] for name in ("level_x", "level_y", "height"))
     np.testing.assert_allclose(height, world @ up, rtol=1e-9, atol=1e-12)
     # The other two are level, and the three are lengths along axes at right angles.
     flat = world - (world @ up)[:, None] * up

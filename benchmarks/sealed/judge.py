@@ -68,6 +68,7 @@ def judge(
     if report is not None:
         row |= _held_out(report, shown["floor_px"])
         row |= {"verdict": report["verdict"], "seconds": report.get("seconds")}
+        row["second_look"] = report.get("second_look", False)
         for effect in effects:
             if "nothing was claimed" in effect["reason"]:
                 unproven = report.get("left_over", {}).get("unproven")

@@ -250,7 +250,28 @@ def markdown(rows: list[dict], title: str, hashes: list[str]) -> str:
         lines.append("| " + " | ".join([name, *(str(own.get(k, 0)) for k in keys)]) + " |")
     lines += ["", "## What went wrong", ""]
     lines += [f"- {text}" for text in failures(rows)] or ["Nothing."]
+    looks = second_looks(rows)
+    lines += (
+        ["", "## Found at a second look", "", *(f"- {text}" for text in looks)] if looks else []
+    )
     return "\n".join(lines) + "\n"
+
+
+def second_looks(rows: list[dict]) -> list[str]:
+    """What was found with all epochs, where two thirds of them showed nothing."""
+    return [
+        f"{row['id']}: {', '.join(row['named'])}; "
+        + (", ".join(map(_hidden, row["effects"])) or "nothing is hidden")
+        for row in rows
+        if row.get("second_look")
+    ]
+
+
+def _hidden(effect: dict) -> str:
+    """An effect, how well it shows, and whether its name was found."""
+    where = "first" if effect["first"] else "in the set" if effect["in_set"] else "not in the set"
+    where = "outside" if effect["outside"] else where
+    return f"{effect['effect']} (lambda {effect['expected_drop']:.0f}, {where})"
 
 
 def failures(rows: list[dict]) -> list[str]:
@@ -271,7 +292,9 @@ def failures(rows: list[dict]) -> list[str]:
         for effect in row["effects"]:
             name = f"{row['id']}: {effect['effect']}"
             if effect["shown"] and effect["reason"]:
-                found.append(f"{name}: {effect['reason']}")
+                paid = effect["in_set"] or effect.get("affordable", True)
+                dear = "" if paid else "; its unknowns cost more than they show (1a)"
+                found.append(f"{name}: {effect['reason']}{dear}")
             elif effect["decidable"] and not effect["outside"] and not effect["first"]:
                 found.append(
                     f"{name}: in the set but not first, though decidable; {_instead(row, effect)}"
